@@ -1,1 +1,1 @@
-"""Simulation: machines on a terrain, their sensors and their truth; nothing at run time imports it."""
+"""Simulation: machines on a terrain, their sensors and the ground truth. Not imported at run time."""

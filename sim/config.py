@@ -1,7 +1,4 @@
-"""Options of a simulation run, as `config/sim.toml` describes them: a scenario, what differs from it, and the pace.
-
-Also the files that agents of its machines are given.
-"""
+"""Options of a simulation run (`config/sim.toml`), and the configuration files for its agents."""
 
 from __future__ import annotations
 
@@ -30,13 +27,13 @@ log = logging.getLogger("sim.config")
 
 @dataclass(frozen=True)
 class SimConfig:
-    """What is simulated, and how fast. Options that are None are as the scenario says.
+    """A scenario, this run's changes to it, and the pace. None: as in the scenario.
 
-    scenario: a name of `sim/scenario/`, or the path of a TOML file. machines: of the scenario's first fleet. names: of
-    all machines. seconds: simulated time, 0 runs until stopped. preset, drive_mps, gps, imu, attitude, payload: of
-    every fleet. speed: times real time, 0 as fast as possible. receivers: what they speak on ports, `ubx` or `nmea`;
-    empty: their readings are in bundles, like all others. can: the bus of the first machine (`virtual://site`, `can0`),
-    of which the others count on; empty: drive trains are in bundles, or on the buses of the scenario alone.
+    scenario: name in `sim/scenario/`, or path of a TOML file. machines: in the first fleet. names: of all machines.
+    seconds: 0: endless. preset, drive_mps, gps, imu, attitude, payload: for every fleet. speed: multiple of real time,
+    0: as fast as possible. receivers: protocol on the ports, `ubx` or `nmea`; empty: readings travel in bundles. can:
+    bus of the first machine (`virtual://site`, `can0`), the others count on; empty: drive trains in bundles, or on the
+    scenario's buses.
     """
 
     scenario: str = "paper_site"
@@ -78,7 +75,7 @@ def load_sim(path: Path) -> SimConfig:
 
 
 def resolve(config: SimConfig) -> Scenario:
-    """The scenario with the options of this run; a ConfigError says what does not fit."""
+    """The scenario with the run's options; ConfigError where they do not fit."""
     scenario = load_scenario(config.scenario)
     where = f"scenario {config.scenario}"
     names = ("preset", "drive_mps", "gps", "imu", "attitude", "payload")
@@ -98,9 +95,9 @@ def resolve(config: SimConfig) -> Scenario:
 
 
 def write_configs(config: SimConfig, folder: Path, ports: Path | None = None) -> list[Path]:
-    """Write `site.toml` and `<machine>.toml` for the agents, nothing of the truth; returns those of the machines.
+    """Write `site.toml` and the agents' `<machine>.toml`, without the truth; returns the machines' files.
 
-    ports: the folder of the receivers' ports, where they speak on any; agents read them there.
+    ports: folder of the receivers' ports.
     """
     scenario = resolve(config)
     folder.mkdir(parents=True, exist_ok=True)
@@ -118,7 +115,6 @@ def write_configs(config: SimConfig, folder: Path, ports: Path | None = None) ->
 
 
 def _world(asked: str | None, scenario: Scenario) -> str:
-    """What moves the machines: the fast world where PyBullet is not installed, unless that is asked for."""
     if asked or scenario.world == "fast" or find_spec("pybullet"):
         return asked or scenario.world
     log.warning("the fast world takes its place problem='PyBullet has wheels for Python 3.11 alone'")

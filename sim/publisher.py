@@ -22,12 +22,12 @@ from sim.recorder import write_truth
 from sim.simulator import Simulator
 
 PROGRESS_S = 0.2
-WAIT_S = 30.0  # for subscribers: agents that are started by hand after the simulator have that long
+WAIT_S = 30.0  # timeout for subscribers: agents started by hand
 
 
 @dataclass(frozen=True)
 class SimReport:
-    """How a run went. bundles: of each machine, without the closing one. late_s: the most it fell behind its pace."""
+    """Summary of a run. bundles: per machine, without the closing one. late_s: largest lag."""
 
     machines: int
     simulated_s: float
@@ -49,11 +49,10 @@ def run(
     ports_dir: Path | None = None,
     wait_s: float = WAIT_S,
 ) -> SimReport:
-    """Simulate and publish until `config.seconds` are over or `stop` is set.
+    """Simulate and publish until `config.seconds` have passed or `stop` is set; the truth is always written at the end.
 
-    Waits first until every machine has a subscriber, at most wait_s, else a LinkError; not with ports_dir, the folder
-    of the receivers' ports: they speak whether anybody listens or not. on_progress gets the simulated time about five
-    times a second. The truth is written at the end, whatever ends the run.
+    First waits up to wait_s for a subscriber of every machine, else LinkError; not if ports_dir, the folder of the
+    receivers' ports, is given. on_progress gets the simulated time about five times a second.
     """
     with contextlib.ExitStack() as opened:
         simulator = opened.enter_context(contextlib.closing(Simulator(config)))
@@ -89,7 +88,7 @@ def _drive(
         if stop.is_set():
             break
         step = simulator.advance()
-        pace.wait(simulator.simulated_s)  # a bundle is due when its span is over
+        pace.wait(simulator.simulated_s)  # a bundle is due at the end of its span
         for stream in streams:
             sensed = step[stream.machine]
             if buses:
@@ -128,7 +127,7 @@ def _streams(simulator: Simulator, session_config: SessionConfig) -> Iterator[li
 def _await_subscribers(
     streams: list[BundleStream], wait_s: float, stop: threading.Event, clock: Callable[[], float]
 ) -> list[str]:
-    """Wait until every machine has a subscriber, or the run is stopped; returns the machines that got none in time."""
+    """Wait for subscribers or `stop`; returns the machines without one."""
     deadline = clock() + wait_s
     while (missing := [s.machine for s in streams if not s.has_subscriber]) and not stop.is_set():
         if clock() >= deadline:
@@ -138,7 +137,7 @@ def _await_subscribers(
 
 
 def throttled(call: Callable[[float], None], clock: Callable[[], float]) -> Callable[[float], None]:
-    """The same call, but at most once in PROGRESS_S."""
+    """Limit calls to one per PROGRESS_S."""
     last = clock() - PROGRESS_S
 
     def now_and_then(simulated_s: float) -> None:

@@ -1,4 +1,4 @@
-"""Simulate into log folders, with no network."""
+"""Simulate into log folders, without a network."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ TRACKS_FOLDER = "tracks"
 
 
 def write_truth(folder: Path, simulator: Simulator) -> None:
-    """Write the truth map and the tracks so far: `truth_map.npz` and `tracks/<machine>.csv`.
+    """Write the truth map and tracks so far: `truth_map.npz`, `tracks/<machine>.csv`.
 
-    Where the ground changed, `truth_map_until_<second>s.npz` holds what was true before.
+    Before each change of the ground: `truth_map_until_<second>s.npz`.
     """
     simulator.truth_map.save(folder / MAP_FILE)
     for until_s, former in simulator.former_truth_maps:
@@ -36,10 +36,10 @@ def record(
     on_progress: Callable[[float], None] = lambda _: None,
     stop: threading.Event | None = None,
 ) -> Simulator:
-    """Simulate into `<record_dir>/<machine>/log.toml` and its CSV files; the truth goes to truth_dir.
+    """Simulate into `<record_dir>/<machine>/log.toml` and CSV files; the truth goes to truth_dir.
 
-    on_progress gets the simulated time after every bundle. stop: once set, the recording ends with what it has. Returns
-    the simulator, at its end and closed. ConfigError where the folder has a recording already.
+    on_progress gets the simulated time per bundle; stop ends the recording early. Returns the closed simulator.
+    ConfigError if the folder holds a recording.
     """
     if used := sorted(record_dir.glob(f"*/{MANIFEST}")):
         problem = f"has a recording of {used[0].parent.name} already; choose another folder, or remove that"

@@ -1,4 +1,4 @@
-"""The simulator: drivers, a world, the sensors of its machines and their truth, one bundle of readings at a time."""
+"""The simulator: drivers, world, sensors and truth, one bundle of readings at a time."""
 
 from __future__ import annotations
 
@@ -32,20 +32,19 @@ from sim.worlds.world import World
 
 STEP_MS = 10
 STEP_NS = STEP_MS * 1_000_000
-BUNDLE_MS = 50  # simulated time in one message: five steps, so that messages to agents come at 20 Hz
-START_NS = 1_767_225_600_000_000_000  # stamp of the start, 2026-01-01T00:00:00Z: fixed, so that seeds repeat runs
+BUNDLE_MS = 50  # simulated time per bundle: five steps, 20 Hz
+START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z, fixed so that a seed repeats a run
 
 
 class Simulator:
-    """Simulates the machines of one site; the same config gives the same readings, bit for bit.
+    """Simulates the machines of one site; reproducible bit for bit.
 
-    site, machines: what agents may know. truth_map, tracks(): what only a comparison may see; former_truth_maps: the
-    ground before each change so far, with the simulated second of that change. buses: of machines that speak CAN, by
-    name; frames: what these carried in the last span. close() ends the world.
+    site, machines: what agents may know. truth_map, tracks(): for comparisons only. former_truth_maps: (second of a
+    change, ground before). buses: of machines with CAN, by name. frames: of the last span.
     """
 
     def __init__(self, config: SimConfig, scenario: Scenario | None = None, *, bundle_ms: int = BUNDLE_MS) -> None:
-        """scenario: in place of the one that config names. bundle_ms: a multiple of STEP_MS."""
+        """scenario: replaces the config's. bundle_ms: a multiple of STEP_MS."""
         self.config, self._bundle_ms = config, bundle_ms
         self.scenario: Scenario = scenario or resolve(config)
         self.site: SiteConfig = self.scenario.site
@@ -80,22 +79,22 @@ class Simulator:
 
     @property
     def simulated_s(self) -> float:
-        """Simulated time since the start."""
+        """Time since the start."""
         return self._steps * STEP_MS / 1000
 
     @property
     def bundles(self) -> int | None:
-        """How many bundles the run has; None if it ends only when it is stopped."""
+        """Bundles in the run; None: endless."""
         seconds = self.scenario.seconds
         return -int(-seconds * 1000 // self._bundle_ms) if seconds else None
 
     @property
     def state(self) -> FleetState:
-        """True state of all machines."""
+        """True state."""
         return self._world.state
 
     def advance(self) -> dict[str, list[Reading]]:
-        """Simulate the span of one bundle; returns readings of each machine, in order of stamps."""
+        """Simulate one bundle; returns each machine's readings by stamp."""
         span = self.sense()
         readings = {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
         for name, bus in self.buses.items():
@@ -103,7 +102,7 @@ class Simulator:
         return readings
 
     def sense(self) -> FleetReadings:
-        """Simulate the span of one bundle; returns the readings of all machines as columns, without those of buses."""
+        """Simulate one bundle; returns all readings as columns, without those on buses."""
         count = self._bundle_ms // STEP_MS
         states = stack([self.step() for _ in range(count)])
         steps = np.arange(self._steps - count + 1, self._steps + 1)
@@ -117,26 +116,23 @@ class Simulator:
         return self._sensors.sample(steps, stamps_ns, states)
 
     def close(self) -> None:
-        """End the world."""
+        """Close the world."""
         self._world.close()
 
     def tracks(self) -> dict[str, Table]:
-        """True track of each machine so far: rows of `truth.TRACK_DTYPE` at 10 Hz."""
+        """True tracks so far by machine: rows of `truth.TRACK_DTYPE`, 10 Hz."""
         empty = np.empty((0, len(self.machines)), TRACK_DTYPE)
         rows = np.concatenate([empty, *self._tracks])
         return {machine.name: rows[:, i].copy() for i, machine in enumerate(self.machines)}
 
     @property
     def truth_map(self) -> TruthMap:
-        """The ground as it is now."""
+        """The current ground."""
         ground = self.scenario.ground
         return truth_map(self.terrain, ground.width_m, ground.depth_m, self.site.cell_m)
 
     def step(self) -> FleetState:
-        """Simulate STEP_S without reading the sensors; returns the true state after it.
-
-        Drivers look out, and act, less often than the world moves.
-        """
+        """Simulate STEP_S without sensors; returns the new true state."""
         state = self._world.state
         while self._changes and self._changes[0].at_s <= self.simulated_s:
             self._change_ground()
@@ -162,7 +158,7 @@ class Simulator:
 def build_world(
     name: str, terrain: Terrain, models: Sequence[MachineModel], bodies: Bodies, starts: Sequence[Start]
 ) -> World:
-    """Put machines into a world of that name, `pybullet` or `fast`, their joints on their starts."""
+    """Create the world `pybullet` or `fast`, joints on their starts."""
     rear_m = np.array([model.rear_to_joint_m for model in models])
     heading = np.array([start.heading_rad for start in starts])
     joint = np.array([start.joint_m for start in starts])
@@ -170,7 +166,7 @@ def build_world(
     places: Floats = np.column_stack([base, heading])
     if name == "fast":
         return FastWorld(terrain, models, bodies, places)
-    from sim.worlds.bullet import BulletWorld  # imported here: the fast world needs no PyBullet
+    from sim.worlds.bullet import BulletWorld  # the fast world needs no PyBullet
 
     return BulletWorld(terrain, models, bodies, places)
 

@@ -1,4 +1,4 @@
-"""The true state of all machines at one instant: what worlds compute, and sensors, drivers and pictures read."""
+"""True state of all machines: from worlds, for sensors, drivers and pictures."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ STEP_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class FleetState:
-    """True state of n machines at one instant; every array has the shape (n,), or (n, k) where k is given.
+    """True state of n machines; arrays (n,), or (n, k) where k is given.
 
-    Position of `base_link` in `map`, attitude as yaw, pitch (nose down) and roll, speed along the ground, negative in
-    reverse. rates, rates_dot: angular rate and acceleration in `base_link` (3). force: specific force at `base_link`,
-    in its axes, gravity included (3). articulation: angle of the front frame, its rate and acceleration; the frames are
-    rigid, so these carry rates and force over to the front one. wheel_*: of the rear axle, left and right (2). torque:
-    at all wheels together. load: of all wheels on the ground. mass: with the payload. c_rr, grade: of the ground under
-    the wheels, weighted by their loads, and as the plane through them.
+    Position of `base_link` in `map`; yaw, pitch (nose down), roll; speed along the ground, negative in reverse. rates,
+    rates_dot (3): angular rate and acceleration in `base_link`. force (3): specific force at `base_link` in its axes,
+    gravity included. articulation: of the front frame; angle, rate, acceleration carry rates and force over to it.
+    wheel_* (2): rear left and right. torque, load: of all wheels. mass: with payload. c_rr: under the wheels, by load.
+    grade: of the plane through the wheels.
     """
 
     x_m: Floats
@@ -52,5 +51,5 @@ class FleetState:
 
 
 def stack(states: list[FleetState]) -> FleetState:
-    """Join k states into one with arrays (k, n, ...)."""
+    """Stack k states into arrays (k, n, ...)."""
     return FleetState(*(np.array([getattr(s, f.name) for s in states]) for f in fields(FleetState)))

@@ -1,4 +1,4 @@
-"""The true ground and the machines' true tracks, kept apart from what sensors read; for comparisons only."""
+"""True ground and tracks, kept apart from sensors; for comparisons only."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from protocol.arrays import Floats32, Table
 from protocol.errors import StoreError
 from sim.terrain.terrain import C_RR, Terrain
 
-TRACK_EVERY = 10  # steps: 10 Hz
-# Column of a track -> what it takes from the state record [m, rad, m/s, kg, -, m/m]
+TRACK_EVERY = 10  # steps per row: 10 Hz
+# Track column -> field of the state [m, rad, m/s, kg, -, m/m].
 TRACK_VALUES = {"x": "x_m", "y": "y_m", "z": "z_m", "yaw": "yaw_rad", "pitch": "pitch_rad", "roll": "roll_rad"}
 TRACK_VALUES |= {"speed": "speed_mps", "mass": "mass_kg", "c_rr": "c_rr", "grade_e": "grade_e", "grade_n": "grade_n"}
-WORK = "work"  # column: what the engine has done at the wheels so far, drive force times way [J]
+WORK = "work"  # column: engine work at the wheels so far [J]
 TRACK_DTYPE = np.dtype([("stamp_ns", "<i8"), *((name, "<f8") for name in (*TRACK_VALUES, WORK))])
 MAP_FILE = "truth_map.npz"
 
 
 @dataclass(frozen=True)
 class TruthMap:
-    """The true layers of a site: (rows, columns) float32, rows to the north, values at the cells' centres.
+    """True layers of a site: (rows, columns) float32, rows northwards, values at cell centres.
 
-    west_m, south_m: the south-west corner of cell (0, 0). grade_*: gradient over the cell [m/m].
+    west_m, south_m: corner of cell (0, 0). grade_*: over the cell [m/m].
     """
 
     west_m: float
@@ -38,13 +38,13 @@ class TruthMap:
     cell_m: float = 1.0
 
     def save(self, path: Path) -> None:
-        """Write as .npz, whose name must end so."""
+        """Write as .npz, the required suffix."""
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(path, **vars(self))
 
     @classmethod
     def load(cls, path: Path) -> TruthMap:
-        """Read what `save` wrote; a StoreError if that is not what the file holds."""
+        """Read what `save` wrote; else StoreError."""
         try:
             with path.open("rb") as file, np.load(file) as data:
                 west_m, south_m, cell_m = (float(data[name]) for name in ("west_m", "south_m", "cell_m"))
@@ -54,11 +54,11 @@ class TruthMap:
 
 
 def truth_map(terrain: Terrain, width_m: float, depth_m: float, cell_m: float = 1.0) -> TruthMap:
-    """Survey a terrain from the origin of `map` on."""
+    """Survey a terrain from the origin of `map`."""
     east = (np.arange(round(width_m / cell_m)) + 0.5) * cell_m
     north = (np.arange(round(depth_m / cell_m)) + 0.5) * cell_m
     x, y = np.meshgrid(east, north)
-    half = cell_m / 2  # the gradient over the cell, not of the little patch that the centre lies on
+    half = cell_m / 2  # over the whole cell, not the terrain patch at its centre
     rise_e = (terrain.height(x + half, y) - terrain.height(x - half, y)) / cell_m
     rise_n = (terrain.height(x, y + half) - terrain.height(x, y - half)) / cell_m
     c_rr, east, north = (layer.astype(np.float32) for layer in (C_RR[terrain.zone(x, y)], rise_e, rise_n))
@@ -66,7 +66,7 @@ def truth_map(terrain: Terrain, width_m: float, depth_m: float, cell_m: float = 
 
 
 def save_tracks(folder: Path, tracks: Mapping[str, Table]) -> None:
-    """Write one CSV file per machine: <machine>.csv with the columns of TRACK_DTYPE."""
+    """Write <machine>.csv with the columns of TRACK_DTYPE."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, track in tracks.items():
         with (folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as text:

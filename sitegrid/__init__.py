@@ -4,14 +4,14 @@ with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
     ground = site.region((0, 0, 200, 150), ["resistance"])
 """
 
-TYPE_CHECKING = False  # as that of `typing`, which this need not import
+TYPE_CHECKING = False  # like `typing.TYPE_CHECKING`, without importing `typing`
 if TYPE_CHECKING:
     from sitegrid.api import *  # noqa: F403 - it has __all__
     from sitegrid.api import __version__ as __version__
 
 
 def __getattr__(name: str) -> object:
-    """Import what a program uses when it does: the command begins here too, and hears Ctrl-C before numpy is loaded."""
+    """Import on demand: the command starts here too, and must handle Ctrl-C before numpy is loaded."""
     from importlib import import_module
 
     api = import_module("sitegrid.api")

@@ -45,11 +45,11 @@ from sitegrid.process.lifetime import plain
 from sitegrid.times import utc_text
 from sitegrid.trust_sentences import calibrated, why
 
-Answer = tuple[Any, Iterable[str]]  # a table for programs; lines for people
+Answer = tuple[Any, Iterable[str]]  # table for programs, lines for people
 
 
 def record_text(_: Client, __: Any, answer: Any) -> Answer:
-    """An answer that has no table of its own: its fields."""
+    """Fields of an answer without a table of its own."""
     table = plain(answer)
     lines = []
     for name, value in table.items():
@@ -68,7 +68,7 @@ def _point(client: Client, query: PointQuery, point: PointAnswer) -> Answer:
 
 
 def _off_map(client: Client, x_m: float, y_m: float) -> list[str]:
-    """Where the map lies, for who asks for another place."""
+    """The map's extent, if the place is outside it."""
     info = client.info()
     west, south, east, north = (edge * info.site.cell_m for edge in info.bounds or (0, 0, 0, 0))
     is_inside = west <= x_m < east and south <= y_m < north
@@ -163,7 +163,7 @@ def _worklist(_: Client, __: WorklistQuery, answer: Worklist) -> Answer:
 
 
 def fuel_text(fuel: Fuel) -> str:
-    """Litres predicted and burned, with their doubt and the share of the driving that they are of."""
+    """Predicted and burned litres, their intervals, and the share of driving that they cover."""
     (predicted, low, high), (burned, least, most) = fuel.predicted_ph, fuel.burned_ph
     pairs = f"predicted {predicted:.2f} ({low:.2f} to {high:.2f}), burned {burned:.2f} ({least:.2f} to {most:.2f}) l/h"
     return f"{pairs}, of {100 * fuel.share:.0f} % of the driving"
@@ -192,7 +192,7 @@ def _calibration(_: Client, __: CalibrationQuery, answer: CalibrationAnswer) -> 
 
 
 def calibration_table(answer: CalibrationAnswer) -> list[str]:
-    """A line for each machine, and what is known of their common scale."""
+    """One line per machine, and the state of the common scale."""
     head = ["machine", "zero", "+-", "scale", "+-", "across", "+-", "known by", "taken off since", "by"]
     lines = _table(head, map(_calibration_row, answer.machines))
     if answer.common_scale_unknown:
@@ -201,7 +201,7 @@ def calibration_table(answer: CalibrationAnswer) -> list[str]:
 
 
 def _calibration_row(machine: MachineCalibration) -> list[str]:
-    """Zeros and slopes in m/m; of what counts, the newest span."""
+    """Bias and slopes in m/m; of the corrections the newest span."""
     values = (machine.zero, machine.zero_std, machine.scale, machine.scale_std, machine.across, machine.across_std)
     shown = [f"{name} {'+'.join(by)}" for name, by in (("zero", machine.zero_by), ("scale", machine.scale_by)) if by]
     newest, decided = "nothing", "-"
@@ -219,7 +219,7 @@ def _changes(_: Client, __: ChangesQuery, answer: ChangesAnswer) -> Answer:
 
 
 def change_line(change: GroundChange) -> str:
-    """When, where, and from which ground to which."""
+    """Time, place, old and new ground."""
     west, south, east, north = change.bounds
     parts = [f"{change.id}: {utc_text(change.first_ns)} to {utc_text(change.last_ns)}"]
     parts += [f"{west:g}..{east:g} x {south:g}..{north:g} m", f"{change.cells} cells"]
@@ -245,7 +245,7 @@ def _info(_: Client, __: InfoQuery, info: MapInfo) -> Answer:
 
 
 def _drive(_: Client, query: LineQuery, answer: RouteAnswer) -> Answer:
-    """What a drive costs, in a line of totals and a table of steps."""
+    """Totals in a line, steps in a table."""
     totals, steps, machine = answer.totals, answer.steps, answer.machine
     corners = (
         []
@@ -288,14 +288,13 @@ def _alive(_: Client, __: AliveQuery, alive: ServerAlive) -> Answer:
 
 
 def _checkpoints(counts: CheckpointCounts) -> str:
-    """What makes maps of the past quick."""
     newest = f", samples until {utc_text(counts.newest_ns)}" if counts.newest_ns else ""
     damaged = f", {counts.passed_over} damaged" if counts.passed_over else ""
     return f"checkpoints {counts.count} ({counts.bytes / 1e6:.0f} MB){newest}{damaged}"
 
 
 def _as_of(query: Compared[Any], stamp_ns: int) -> str:
-    """What to say of the time of an answer, nothing where it is the map as it is."""
+    """Note on the time of an answer; empty for the current map."""
     as_of = f", as of {utc_text(stamp_ns)}" if query.as_of_ns else ""
     return as_of + (f", minus that of {utc_text(query.minus_ns)}" if query.minus_ns else "")
 

@@ -1,8 +1,7 @@
-"""Copies of a live store: made, looked through, and put back.
+"""Backups of a live store: made, verified, restored.
 
-A backup is a store's folder without its caches: the journal as it was at one commit, the files of the archive up to the
-row where that begins, and the files that say which site it is. It is made beside its place, and gets its name once it
-is whole and has been read back.
+A backup is a store's folder without caches: the journal at one commit, the archive files up to the journal's first row,
+and the files that identify the site. It is written beside its place and renamed once read back whole.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ from mapserver.journal.rows import SpoolKey, Watermark
 from protocol.errors import ConfigError, StoreError
 from protocol.files import sync_folder
 
-BESIDE = ("site.toml", "server.toml")  # copied where they are in the store
+BESIDE = ("site.toml", "server.toml")  # copied if present
 
 
 @dataclass(frozen=True)
 class BackupReport:
-    """What was looked through, all of it: rows with their samples, events, files of the archive, and spools."""
+    """Contents that were verified: rows with samples, events, archive files, spools."""
 
     store: str
     rows: int
@@ -44,12 +43,12 @@ class BackupReport:
 
 
 def backup(store: Path, out: Path) -> BackupReport:
-    """Copy a store, also while its server writes, and read the copy back; StoreError, ConfigError."""
+    """Copy a store, even while its server writes, and verify the copy; StoreError, ConfigError."""
     with _making(store, out) as (source, part):
         _require_whole(source)
         with source.file_reader() as journal:
             journal.copy_to(part / JOURNAL_FILE)
-        with JournalLocation(part).reader() as copied:  # what moves to the archive from now on is in the copy
+        with JournalLocation(part).reader() as copied:  # rows that move to the archive from now on are in the copy
             archived, decisions = copied.archived_row, calibrations(copied)
             identity = copied.identity().id
         _copy_archive(source, part, archived)
@@ -59,7 +58,7 @@ def backup(store: Path, out: Path) -> BackupReport:
 
 
 def restore(copy: Path, store: Path) -> BackupReport:
-    """Make a store of a backup; the backup is read through before, and the store after."""
+    """Make a store from a backup; verified before and after."""
     if is_in_use(copy):
         raise ConfigError(copy, "is the store of a server that runs, and no backup; make one of it: sitegrid backup")
     verify(copy)
@@ -74,21 +73,21 @@ def restore(copy: Path, store: Path) -> BackupReport:
 
 
 def verify(store: Path) -> BackupReport:
-    """Read all of a store or a backup; StoreError names the first thing that is not as it was written."""
+    """Read a whole store or backup; StoreError names the first deviation."""
     location = _journal_of(store)
     _require_whole(location)
     return _examined(location, live=is_in_use(store))
 
 
 def _require_whole(location: JournalLocation) -> None:
-    """StoreError where the journal lacks what was acknowledged, and no start of a server has named that."""
+    """StoreError if acknowledged samples are missing and no server start has recorded it."""
     if shortfall := lacking(location):
         advice = "restore a backup, or start a map server on it once: it keeps a note of that, and goes on"
         raise StoreError(location, f"lacks what was acknowledged: {shortfall}; {advice}")
 
 
 def _examined(location: JournalLocation, *, live: bool) -> BackupReport:
-    """Read all. live: batches come in meanwhile, so that rows and watermarks are not compared."""
+    """Read everything. live: batches arrive meanwhile, so rows and watermarks are not compared."""
     rows, samples, reached = 0, Counter[SpoolKey](), Counter[SpoolKey]()
     with location.file_reader() as journal:
         journal.require_sound()
@@ -127,7 +126,7 @@ def _journal_of(store: Path) -> JournalLocation:
 
 @contextmanager
 def _making(source: Path, out: Path) -> Iterator[tuple[JournalLocation, Path]]:
-    """A folder beside its place, which gets its name in the end; after an error it is gone."""
+    """A folder beside its place, renamed at the end, removed after an error."""
     location, out = _journal_of(source), out.absolute()
     part = out.with_name(f"{out.name}.part")
     with hold_place(part):
@@ -135,7 +134,7 @@ def _making(source: Path, out: Path) -> Iterator[tuple[JournalLocation, Path]]:
             raise ConfigError(out, "exists and is not empty; choose another --out")
         try:
             if part.exists():
-                shutil.rmtree(part)  # of one that was killed
+                shutil.rmtree(part)  # left by a killed run
             part.mkdir()
             yield location, part
             for name in BESIDE:
@@ -147,11 +146,11 @@ def _making(source: Path, out: Path) -> Iterator[tuple[JournalLocation, Path]]:
         except OSError as error:
             raise StoreError(out, f"cannot be written: {error.strerror or error}") from None
         finally:
-            shutil.rmtree(part, ignore_errors=True)  # nothing, where it has its name
+            shutil.rmtree(part, ignore_errors=True)  # nothing, after the rename
 
 
 def _copy_archive(source: JournalLocation, part: Path, until: int) -> None:
-    """Copy the files with rows up to this one; they never change."""
+    """Copy archive files with rows up to `until`; they never change."""
     if until:
         folder = JournalLocation(part).archive.folder
         folder.mkdir()
@@ -160,7 +159,7 @@ def _copy_archive(source: JournalLocation, part: Path, until: int) -> None:
 
 
 def _copy(path: Path, folder: Path) -> None:
-    """Copy a file, to disk: the server that has the original may forget its rows as soon as there is a backup."""
+    """Copy and sync, because the server may forget the original once there is a backup."""
     shutil.copy2(path, folder)
     with (folder / path.name).open("rb") as file:
         os.fsync(file.fileno())
@@ -168,7 +167,7 @@ def _copy(path: Path, folder: Path) -> None:
 
 
 def lines(store: Path, examined: BackupReport) -> list[str]:
-    """What was looked through, for people."""
+    """The report for people."""
     e = examined
     return [
         f"{store}: store {e.store}, all as it was written",

@@ -1,4 +1,4 @@
-"""The Python client of the map. It needs the base install only."""
+"""The Python client of the map; the base install suffices."""
 
 from __future__ import annotations
 
@@ -44,24 +44,24 @@ from sitegrid.times import Time, parse_time
 from sitegrid.watch import AGAIN_S, watch, watch_async
 from sitegrid.whole_answers import Progress, whole_answer
 
-SOLVE_S = 30.0  # that the server has to calibrate a fleet for: a large one on a busy host
+SOLVE_S = 30.0  # the server's time to calibrate a large fleet on a busy host
 Layers = str | Sequence[str]
 Area = Bounds | tuple[float, float, float, float] | Sequence[Place]
 T = TypeVar("T")
 
 
 class Client:
-    """Asks the map server of one site, and its followers where there are any.
+    """Queries the map server of one site, and its followers.
 
-    `ask` takes every query (`sitegrid.QUERIES`); methods are for the usual ones.
-    origin: who gave the last answer, and how far behind the journal its map was.
-    Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read). A
-    question that nobody takes, or whose server ends, is asked again for timeout_s: a restart of router or server shows
-    as an answer that comes later.
-    Arguments of several methods: layers: names, or a text of them with commas; none for all. as_of: the map from
-    samples of this time or earlier: a stamp in nanoseconds, a `datetime`, ISO 8601, or "-1h" before the newest sample.
-    after: answer once this journal row is merged, and wait for it at most 10 s.
-    Fields that end in _ns are stamps, UTC in nanoseconds; `stamp` makes one of any time.
+    `ask` takes every query (`sitegrid.QUERIES`); methods cover the usual ones. origin: who gave the last answer, and
+    the lag of its map behind the journal.
+
+    Errors of every call: QueryError (refused), LinkError (no answer), MessageError (unreadable answer). Without an
+    answer a query is retried for timeout_s, so a restart of router or server only delays it.
+
+    Common arguments. layers: names, or a comma-separated text; none: all. as_of: the map from samples up to this time:
+    nanoseconds, `datetime`, ISO 8601, or "-1h" before the newest sample. after: answer once this journal row is merged;
+    waits at most 10 s. Fields that end in _ns are stamps, UTC in nanoseconds; `stamp` converts any time.
     """
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float = 10.0) -> None:
@@ -72,9 +72,9 @@ class Client:
         self._site: SiteInfo | None = None
 
     def ask(self, query: MapQuery[T], *, progress: Progress | None = None) -> T:
-        """The whole answer to a query, however many replies it comes in.
+        """The complete answer to a query, in however many replies.
 
-        progress: called with each piece of a large region, as (here, of all).
+        progress: called per piece of a large region with (pieces received, total).
         """
         answer: Any = whole_answer(query, self._answered, progress)
         if isinstance(query, RegionQuery):
@@ -91,7 +91,7 @@ class Client:
         lon: float | None = None,
         as_of: Time | None = None,
     ) -> PointAnswer:
-        """Layers of the cell at a position in `map` [m], or in latitude and longitude [deg]; NaN is unknown."""
+        """Layers of the cell at a position in `map` [m], or at latitude and longitude [deg]; NaN: unknown."""
         if lat is not None and lon is not None:
             x_m, y_m = self.to_map(lat, lon)
         if x_m is None or y_m is None:
@@ -109,10 +109,9 @@ class Client:
     ) -> MapRegion:
         """Layers of all cells of an area, as arrays with coordinates.
 
-        area: cells that a rectangle (west, south, east, north) [m] touches, or those whose centre lies in an outline of
-        corners (x, y) [m]; others are NaN. resolution_m: of larger cells, a multiple of the map's, each the mean of
-        what is known in it.
-        A large region comes in pieces, all of one version of the map; progress: as of `ask`.
+        area: a rectangle (west, south, east, north) [m], every cell it touches; or an outline of corners (x, y) [m],
+        cells with their centre inside, others NaN. resolution_m: multiple of the cell size; means of the known values.
+        A large region arrives in pieces of one map version; progress: as in `ask`.
         """
         query = RegionQuery(area_of(area), _names(layers), resolution_m, as_of_ns=self._as_of(as_of))
         return cast(MapRegion, self.ask(query, progress=progress))
@@ -124,33 +123,33 @@ class Client:
         *,
         as_of: Time | None = None,
     ) -> RouteAnswer:
-        """What a drive along a line of places in `map` [m] costs a machine: energy, time, speed, with 90 % intervals.
+        """Cost of a drive along places in `map` [m]: energy, time, speed, with 90 % intervals.
 
-        machine: its values, the name of a kind (`MACHINES`), or its own name on the site.
+        machine: its values, a kind (`MACHINES`), or a machine's name on the site.
         """
         places = tuple((float(x), float(y)) for x, y in line)
         driven = machine_of(machine) if isinstance(machine, str) else machine
         return self.ask(RouteQuery(places, machine=driven, as_of_ns=self._as_of(as_of)))
 
     def info(self, *, after: int = 0) -> MapInfo:
-        """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
+        """State of map and server: site, rows journalled and merged, machines, counters, layers."""
         return self.ask(InfoQuery(after=after))
 
     def machines(self, *, after: int = 0) -> list[MachineState]:
-        """What the server knows of each machine: whether it is trusted, why, and what it sent."""
+        """State of each machine: trust, reasons, samples."""
         return list(self.ask(MachinesQuery(after=after)).machines)
 
     def changes(self, after_id: int = 0) -> list[GroundChange]:
-        """Changes of the ground with an id beyond this one: when, where, how many cells, from what to what."""
+        """Changes of the ground with an id above after_id."""
         return list(self.ask(ChangesQuery(after_id)).changes)
 
     def watch(
         self, bounds: Area | None = None, layers: Layers = (), *, again_s: float = AGAIN_S, stop: Event | None = None
     ) -> Iterator[Region]:
-        """Regions of what changed in the map, again and again; the first ones are all that there is.
+        """Regions of the map as they change, endlessly; first everything known.
 
-        What they hold is what `region` says then, but for ages, which change with every sample. A map server or router
-        that is away is waited for; what changed meanwhile comes then. End it by `break`, or by `stop`.
+        Values are those of `region`, but ages alone do not count as a change. Outages of server or router are bridged.
+        End it with `break` or `stop`.
         """
         area = None if bounds is None else area_of(bounds)
         rectangle = area if area is None or isinstance(area, Bounds) else around(area)
@@ -160,48 +159,48 @@ class Client:
     def watch_async(
         self, bounds: Area | None = None, layers: Layers = (), *, again_s: float = AGAIN_S, stop: Event | None = None
     ) -> AsyncIterator[Region]:
-        """As `watch`, for `async for`."""
+        """`watch` for `async for`."""
         return watch_async(self.watch(bounds, layers, again_s=again_s, stop=stop))
 
     def stamp(self, time: Time) -> int:
-        """A time as a stamp in nanoseconds; ValueError where it is none."""
+        """A time as a stamp in nanoseconds; ValueError if it is none."""
         return parse_time(time).stamp("time", lambda: self.info().stamp_ns)
 
     def site_info(self) -> SiteInfo:
-        """The site: its name, origin, cells, and `crs`. It is asked for once."""
+        """The site: name, origin, cells, `crs`. Queried once."""
         if self._site is None:
             self._site = self.info().site
         return self._site
 
     def where(self) -> str:
-        """Where the map lies, in a sentence: for who finds nothing at a place."""
+        """The map's extent in a sentence."""
         info = self.info()
         return where_it_lies(info.bounds, info.site.cell_m)
 
     def to_map(self, lat_deg: float, lon_deg: float) -> tuple[float, float]:
-        """Position in `map` [m] of a place on Earth. It needs pyproj."""
+        """Position in `map` [m] of latitude and longitude. Needs pyproj."""
         x_m, y_m, _ = self._projection().to_map(lat_deg, lon_deg, 0.0)
         return x_m, y_m
 
     def to_geodetic(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """Latitude and longitude [deg] of a position in `map` [m]. It needs pyproj."""
+        """Latitude and longitude [deg] of a position in `map` [m]. Needs pyproj."""
         lat_deg, lon_deg, _ = self._projection().to_geodetic(x_m, y_m)
         return lat_deg, lon_deg
 
     def to_geopandas(self, answer: Segments | Worklist | ChangesAnswer) -> Any:
-        """Roads, stretches or changes as a GeoDataFrame in the site's frame. It needs geopandas."""
+        """Roads, worklist rows or changes as a GeoDataFrame in the site's frame. Needs geopandas."""
         return to_geopandas(answer, self.site_info().crs)
 
     def followers(self) -> list[FollowerState]:
-        """Followers that answer, and how far behind the journal each is; LinkError where there is no server either."""
+        """Reachable followers and their lag behind the journal; LinkError if there is no server either."""
         if not (followers := self._asker.followers()):
             self.ask(AliveQuery())
         return followers
 
     def on_change(self, callback: Callable[[GroundChange], object]) -> Listener[GroundChange]:
-        """Call `callback`, on a thread of its own, with each change that is found or grows, until the handle is closed.
+        """Call `callback`, on its own thread, with each change found or grown, until the handle is closed.
 
-        Events are not repeated: ask `changes` for what was before, or was missed.
+        Events are not repeated: query `changes` for earlier or missed ones.
         """
         key = keys.changed(self.site)
         listener = Listener(self.session, key, lambda _, data: answer_codec.decode_change(data), callback)
@@ -209,22 +208,22 @@ class Client:
         return listener
 
     def trust(self, machine: str, reason: str = "", *, wait_s: float = 30.0) -> TrustAnswer:
-        """Use a machine's samples whatever the server finds; returns its state then.
+        """Use a machine's samples whatever the server finds; returns its new state.
 
-        wait_s: how long to wait for the map to be folded again, here as below.
+        wait_s: timeout for the map to be folded again, in the following methods too.
         """
         return self._command(TrustCommand(machine, True, reason, wait_s), wait_s)
 
     def distrust(self, machine: str, reason: str, *, wait_s: float = 30.0) -> TrustAnswer:
-        """Leave a machine's samples out of the map, earlier ones too."""
+        """Exclude a machine's samples from the map, past ones too."""
         return self._command(TrustCommand(machine, False, reason, wait_s), wait_s)
 
     def judge_automatically(self, machine: str, *, wait_s: float = 30.0) -> TrustAnswer:
-        """Leave it to the server again whether a machine's samples are used."""
+        """Let the server decide about a machine's samples again."""
         return self._command(TrustCommand(machine, None, "", wait_s), wait_s)
 
     def calibrate(self, *, wait_s: float = 30.0) -> CalibrationAnswer:
-        """Calibrate all machines with all samples that there are, and have the map follow; what is known then."""
+        """Calibrate all machines with all samples, and update the map; returns the calibration."""
         return self._command(CalibrateCommand(wait_s=wait_s), SOLVE_S + wait_s)
 
     def correct(
@@ -237,16 +236,16 @@ class Client:
         across: float | None = None,
         wait_s: float = 30.0,
     ) -> CalibrationAnswer:
-        """Take these errors off all samples of a machine, whatever the server finds; 0 for what is not given."""
+        """Remove these errors from all samples of a machine, whatever the server finds; default 0."""
         command = CalibrateCommand(machine, zero, scale, across, reason=reason, wait_s=wait_s)
         return self._command(command, SOLVE_S + wait_s)
 
     def calibrate_automatically(self, machine: str, *, wait_s: float = 30.0) -> CalibrationAnswer:
-        """Leave it to the server again what is taken off a machine's samples."""
+        """Let the server decide about a machine's corrections again."""
         return self._command(CalibrateCommand(machine, auto=True, wait_s=wait_s), SOLVE_S + wait_s)
 
     def accept(self, store: str, reason: str) -> MapInfo:
-        """Let the map server's store take the place of another one, which is gone: machines go on with it."""
+        """Let the server's store replace a lost one: machines continue with it."""
         return self._command(AcceptCommand(store, reason), 0.0)
 
     def close(self) -> None:
@@ -263,7 +262,7 @@ class Client:
 
     def _answered(self, query: MapQuery[Any], at: Origin | None = None) -> Answered:
         answered = self._asker.ask(query, at=at)
-        self.origin = answered.origin  # of the last answer of any thread: nothing here goes on with it
+        self.origin = answered.origin  # of the last answer on any thread; informative only
         return answered
 
     def _as_of(self, time: Time | None) -> int | None:
@@ -278,7 +277,7 @@ class Client:
 
 
 def area_of(area: Area) -> Bounds | tuple[Place, ...]:
-    """An area as a query has it."""
+    """An area in the form of queries."""
     if isinstance(area, Bounds):
         return area
     given = np.asarray(area, float)
@@ -297,9 +296,9 @@ def _names(layers: Layers) -> tuple[str, ...]:
 def connect(
     endpoint: str = DEFAULT_ENDPOINT, site: str | None = None, *, timeout_s: float = 10.0, keys: Path | None = None
 ) -> Client:
-    """Connect to the router at `endpoint` and ask for the map of `site`; LinkError if no router is there.
+    """Connect to the router at `endpoint`, as a client of `site`; LinkError if there is no router.
 
-    keys: folder of this client's keys, on a site that has them. site: default that of the keys, else `paper`.
+    keys: folder of this client's keys, on a site with keys. site: default: that of the keys, else `paper`.
     """
     config = join(endpoint, keys, site=site or "")
     name = site or (config.credentials.identity.site if config.credentials else "paper")

@@ -1,7 +1,7 @@
-"""The door of the command: the parser of all commands, and whatever goes wrong behind it as one line and an exit code.
+"""Entry point of the command: the parser of all commands; failures become one line and an exit code.
 
-Errors of our own say what to do themselves. Those of the system, of Zenoh, and a library that is not installed are put
-in words here; anything else is a bug and shows where it is.
+Our errors carry their own advice. Errors of the system, of Zenoh and missing libraries are put in words here. Anything
+else is a bug and shows its traceback.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from sitegrid.options.groups import add_command
 from sitegrid.process import streams
 from sitegrid.process.logs import start_logging
 
-INTERRUPTED = 130  # as a shell has it: 128 and the number of SIGINT
-# What any command may need beside its own extra (`EXTRA` of its module, and `BESIDE` for some of its options).
+INTERRUPTED = 130  # shell convention: 128 + SIGINT
+# Extras that any command may need beside its own (`EXTRA` of its module, `BESIDE` for some options).
 BESIDE = {"cryptography": "security", "filterpy": "paper", "mcap": "record"}
 OURS = ("protocol", "agents", "mapserver", "sim", "sitegrid", "lab")
 ADVICE = {
@@ -43,7 +43,7 @@ log = logging.getLogger("sitegrid.command_line")
 
 
 def run(words: Sequence[str], commands: ModuleType = commands, program: str = "sitegrid") -> int:
-    """Run one of these commands; returns its exit code. SystemExit as argparse raises it: wrong usage, and help."""
+    """Run a command; returns its exit code. SystemExit from argparse: wrong usage, help."""
     streams.complete()
     try:
         code = _run(words, commands, program)
@@ -70,16 +70,16 @@ def _run(words: Sequence[str], commands: ModuleType, program: str) -> int:
             raise
         return _fail(advice, words)
     except OSError as error:
-        log.info("failed", exc_info=True)  # with --verbose, where it came from
+        log.info("failed", exc_info=True)  # --verbose shows the traceback
         return _fail(_system_problem(error), words)
     except KeyboardInterrupt:
         return INTERRUPTED
 
 
 def build_parser(commands: ModuleType = commands, program: str = "sitegrid") -> ArgumentParser:
-    """The parser of all commands, the modules of a package; its docstring's first line describes the program.
+    """Parser of all commands, the modules of a package, described by the first line of its docstring.
 
-    `GROUPS` of the package, names of commands by heading, are what `--help` lists.
+    `--help` lists them by the package's `GROUPS`: heading to names.
     """
     about = (commands.__doc__ or "").partition("\n")[0]
     parser = ArgumentParser(prog=program, description=about, formatter_class=RawDescriptionHelpFormatter)
@@ -96,14 +96,13 @@ def build_parser(commands: ModuleType = commands, program: str = "sitegrid") -> 
 
 
 def _listed(groups: Mapping[str, Sequence[str]], modules: Mapping[str, ModuleType]) -> str:
-    """Commands in groups, a line each."""
     width = max(map(len, modules))
     lines = {title: [f"  {word:<{width}}  {modules[word].HELP}" for word in words] for title, words in groups.items()}
     return "\n\n".join("\n".join([f"{title}:", *listed]) for title, listed in lines.items())
 
 
 def _extra_for(error: ModuleNotFoundError, extra: str, beside: Mapping[str, str] = BESIDE) -> str:
-    """What to install for a command that misses a module; nothing where the module is ours, or no extra has it."""
+    """Advice to install an extra; empty if the module is ours, or in no extra."""
     module = str(error.name).partition(".")[0]
     if module == "pybullet" and sys.version_info >= (3, 12):
         return "PyBullet has wheels for Python 3.11 alone: run this with that, or in the fast world (--world fast)"
@@ -114,7 +113,7 @@ def _extra_for(error: ModuleNotFoundError, extra: str, beside: Mapping[str, str]
 
 
 def _system_problem(error: OSError) -> str:
-    """An error of the system: which file, what is wrong, what to do where that helps."""
+    """A system error: file, problem, advice if there is any."""
     where = f"{error.filename}: " if error.filename is not None else ""
     what = error.strerror or str(error) or type(error).__name__
     advice = f"; {ADVICE[error.errno]}" if error.errno in ADVICE else ""

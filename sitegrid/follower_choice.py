@@ -1,8 +1,8 @@
-"""Whom a client asks: a follower of the site for what is read from the map, else its map server; each question of one.
+"""Choice of the process to query: a follower for map reads, else the map server.
 
-Plain queryables on one key all work on every question, and of those that are complete Zenoh asks one, always the same
-(docs/decisions/0028-followers.md). So each follower answers on keys of its own, and shows a liveliness token as long as
-it does. A client stays with one follower: what it reads never goes back in time because another one is behind.
+Queryables on one key would all work on every query; of complete ones Zenoh picks always the same
+(docs/decisions/0028-followers.md). So each follower has keys of its own and a liveliness token. A client stays with one
+follower, so its reads never go back in time.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from protocol.queries.request import AskFirst, MapQuery
 from protocol.queries.requests import AliveQuery
 from protocol.wire import keys
 
-# Nobody answers, at once: the server starts again, or has just connected (Zenoh issue 2767). It may answer in a moment.
+# Nobody answered at once: the server restarts, or has just connected (Zenoh issue 2767).
 AGAIN_S = 0.1
-PAST_S = 120.0  # how much longer an answer may take that has to be folded from the journal
-LOOK_S = 1.0  # between two looks for followers, each 0.1 ms of the router
-KNOWN_S = 1.0  # for the router's news of who answers
-AVOID_S = 10.0  # a follower that did not answer: after the lease of its link its token is gone
-FOLLOWERS_TRIED = 2  # for one question, before the server is asked: each may take half of the time that is left
-FOLLOWER_WAIT_S = 1.0  # for a row, at a follower that lacks it: one that follows has it after 0.5 s
-TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
-# Refusals that are about who was asked, not about the question.
+PAST_S = 120.0  # extra timeout for answers folded from the journal
+LOOK_S = 1.0  # between two searches for followers, each 0.1 ms of the router
+KNOWN_S = 1.0  # timeout for the router's matching status
+AVOID_S = 10.0  # pause after a follower failed to answer: its link's lease ends within it, and with it the token
+FOLLOWERS_TRIED = 2  # per query before the server; each may take half of the remaining time
+FOLLOWER_WAIT_S = 1.0  # for a row that a follower lacks; a healthy one has it after 0.5 s
+TIMED_OUT = b"Timeout"  # Zenoh's own error reply
+# Refusals that concern the process, not the query.
 ELSEWHERE = (Refusal.AFTER_TIMEOUT, Refusal.NOT_HERE, Refusal.OVERLOADED, Refusal.STORE, "internal")
 
 
 @dataclass(frozen=True)
 class Answered:
-    """An answer, and who gave it."""
+    """An answer and its origin."""
 
     data: bytes
     origin: Origin
 
 
 class _Silence(Enum):
-    """No answer. NOBODY: there was none to take the question, or who had it has ended."""
+    """No answer. NOBODY: no process took the query, or it ended."""
 
     NOBODY = auto()
     TIMED_OUT = auto()
@@ -57,7 +57,7 @@ class _Silence(Enum):
 
 @dataclass(frozen=True)
 class _Attempt:
-    """A question to one process. follower: its name, empty for the server."""
+    """A query to one process. follower: empty for the server."""
 
     key: str
     parameters: Mapping[str, str]
@@ -69,36 +69,36 @@ class _Attempt:
 
 
 class Followers:
-    """Followers of a site that answer, in the order in which this client asks them."""
+    """Reachable followers, in this client's order of preference."""
 
     def __init__(self, session: zenoh.Session, site: str) -> None:
         self._session, self._site = session, site
         self._client = secrets.token_bytes(8)
         self._names: list[str] = []
-        self._look_s = 0.0  # the time of the next look
+        self._look_s = 0.0  # time of the next search
         self._avoided: dict[str, float] = {}  # until when
 
     def in_order(self) -> list[str]:
-        """Names, the first to be asked first."""
+        """Names, preferred first."""
         now_s = time.monotonic()
         if now_s >= self._look_s:
             self._names, self._look_s = preferred(self._client, self.look()), time.monotonic() + LOOK_S
         return [name for name in self._names if self._avoided.get(name, 0.0) <= now_s]
 
     def look(self) -> set[str]:
-        """Names of those whose tokens are there."""
+        """Names with a liveliness token."""
         replies = self._session.liveliness().get(keys.followers_alive_all(self._site), timeout=1.0)
         return {name for reply in replies if reply.ok is not None and (name := _name(str(reply.ok.key_expr)))}
 
     def avoid(self, name: str) -> None:
-        """Ask others for a while, and look again who is there."""
+        """Skip a follower for AVOID_S, and search again."""
         self._avoided[name] = time.monotonic() + AVOID_S
         self._look_s = 0.0
 
 
 def is_answered(session: zenoh.Session, key: str) -> bool:
-    """Whether the router knows of somebody who answers on a key: it says so also where it lets nobody ask."""
-    querier: Any = session.declare_querier(key)  # its matching_status is an object, although declared a bool
+    """Whether the router knows a queryable on a key, even one that this client may not query."""
+    querier: Any = session.declare_querier(key)  # matching_status is an object, although declared a bool
     try:
         end_s = time.monotonic() + KNOWN_S
         while not querier.matching_status.matching:
@@ -111,22 +111,22 @@ def is_answered(session: zenoh.Session, key: str) -> bool:
 
 
 def preferred(client: bytes, names: set[str]) -> list[str]:
-    """Names in the order of one client (rendezvous hashing): each is the first one of equally many clients.
+    """Names in one client's order (rendezvous hashing): every follower is first for equally many clients.
 
-    One that comes or goes changes nothing between the others.
+    Joining and leaving changes nothing between the others.
     """
     return sorted(names, key=lambda name: hashlib.blake2b(client + name.encode(), digest_size=8).digest())
 
 
 class Asker:
-    """Asks followers and map server of one site; see `Client` for what is raised."""
+    """Queries followers and map server of one site; errors as in `Client`."""
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float) -> None:
         self._session, self._endpoint, self._site, self._timeout_s = session, endpoint, site, timeout_s
         self._followers = Followers(session, site)
 
     def ask(self, query: MapQuery[Any], *, at: Origin | None = None) -> Answered:
-        """Ask the map. at: of whoever gave an earlier answer, which has what this one goes on with."""
+        """Query the map. at: origin of an earlier answer that this one continues."""
         wait_s = query.wait_s if query.after else 0.0
         wait_s += PAST_S if query.may_read_journal else 0.0
         if at and at.follower:
@@ -134,9 +134,9 @@ class Asker:
         return self._get(query, wait_s)
 
     def followers(self) -> list[FollowerState]:
-        """Followers whose tokens are there and that answer what can be read, by name."""
+        """Followers that answer readably, by name."""
         states = []
-        for name in sorted(self._followers.look()):  # one by one: routers let no wildcard pass to a name
+        for name in sorted(self._followers.look()):  # routers allow no wildcard for a name
             key = keys.follower_query(self._site, name, AliveQuery.name)
             answered = self._once(_Attempt(key, {}, name), self._timeout_s / 2)
             if isinstance(answered, Answered):
@@ -145,11 +145,11 @@ class Asker:
         return states
 
     def command(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
-        """Have the server carry out a command."""
+        """Have the server execute a command."""
         return self._until_answered(lambda: iter((_Attempt(key, parameters),)), wait_s).data
 
     def _of_follower(self, query: MapQuery[Any], follower: str) -> Answered:
-        """Ask one follower and nobody else: `expired` where it is gone."""
+        """Ask this follower only; QueryError `expired` if it is gone."""
         attempt = self._attempt(query, follower)
         outcome = self._once(attempt, self._timeout_s)
         if isinstance(outcome, Answered):
@@ -180,8 +180,8 @@ class Asker:
         return _Attempt(keys.follower_query(self._site, follower, query.name), parameters, follower)
 
     def _until_answered(self, attempts: Callable[[], Iterator[_Attempt]], wait_s: float) -> Answered:
-        """Make one attempt after the other until one is answered, for as long as nobody holds the question."""
-        held_s, timed_out = time.monotonic(), False  # until when somebody held it
+        """Try one attempt after the other; time out when no process has held the query for timeout_s."""
+        held_s, timed_out = time.monotonic(), False  # until when a process held it
         refusal: QueryError | None = None
         end_s = held_s + self._timeout_s + wait_s
         while (now_s := time.monotonic()) < min(end_s, held_s + self._timeout_s):
@@ -203,7 +203,7 @@ class Asker:
         raise refusal or self._no_answer(timed_out=timed_out)
 
     def _go_on(self, attempt: _Attempt, refusal: QueryError, left_s: float) -> None:
-        """Raise a refusal, unless another attempt may be answered: elsewhere, or here in a moment."""
+        """Raise a refusal, unless another attempt may succeed: elsewhere, or soon."""
         if attempt.follower and refusal.reason in ELSEWHERE:
             return
         if attempt.follower or not 0 < refusal.retry_after_s < left_s - AGAIN_S:
@@ -211,7 +211,7 @@ class Asker:
         time.sleep(refusal.retry_after_s)
 
     def _once(self, attempt: _Attempt, timeout_s: float) -> Answered | QueryError | _Silence:
-        """Ask once. A follower that says what cannot be read, as one of another version, is as good as silent."""
+        """Ask once. An unreadable follower, of another version say, counts as silent."""
         try:
             return self._heard(attempt, timeout_s)
         except MessageError:
@@ -249,7 +249,7 @@ def _state(alive: ServerAlive, origin: Origin) -> FollowerState:
 
 
 def _name(key: str) -> str:
-    """The follower whose token this is, empty for what is none."""
+    """Follower of a token; empty if it is none."""
     try:
         return keys.follower_of(key)
     except ConfigError:

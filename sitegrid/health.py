@@ -1,27 +1,27 @@
-"""What an agent's health says in words; of another version, its values may be anything."""
+"""An agent's health in words; agents of other versions may send any values."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-MOST_PROBLEMS, MOST_SENSORS, MOST_CHARS = 10, 20, 300  # of what is shown of one machine
+MOST_PROBLEMS, MOST_SENSORS, MOST_CHARS = 10, 20, 300  # display limits per machine
 
 
 def status_of(values: Mapping[str, Any]) -> str:
-    """The sentence of an agent on itself; empty where it has none."""
+    """The agent's sentence about itself, or empty."""
     status = values.get("status")
     return one_line(status) if isinstance(status, str) else ""
 
 
 def problems_of(values: Mapping[str, Any]) -> list[str]:
-    """What has to be mended, a sentence each, the worst first."""
+    """Problems to mend, a sentence each, worst first."""
     problems = values.get("problems")
     return [one_line(str(problem)) for problem in problems[:MOST_PROBLEMS]] if isinstance(problems, list) else []
 
 
 def table_of(values: Mapping[str, Any], *names: str) -> Mapping[str, Any]:
-    """A table in tables; empty where there is none."""
+    """A nested table, empty if missing."""
     for name in names:
         table = values.get(name)
         values = table if isinstance(table, Mapping) else {}
@@ -29,14 +29,14 @@ def table_of(values: Mapping[str, Any], *names: str) -> Mapping[str, Any]:
 
 
 def number_of(values: Mapping[str, Any], name: str) -> float | None:
-    """A finite number; None where there is none."""
+    """A finite number, or None."""
     value = values.get(name)
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18
     return value if is_number else None
 
 
 def report_of(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What a page shows of an agent beside its problems; None of what it does not say."""
+    """Page values of an agent besides its problems; None: not stated."""
     pipeline, spool, corrections, lanes = (table_of(values, n) for n in ("pipeline", "spool", "corrections", "lanes"))
     heard = values.get("heard")
     return {
@@ -56,7 +56,7 @@ def report_of(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def line_of(machine: str, report: Mapping[str, Any]) -> str:
-    """One line for people: how sure its place is, its speed, its samples, and the sentence."""
+    """One line for people: position uncertainty, speed, samples, status."""
     pipeline = report["pipeline"]
     std_m, speed_mps = pipeline["position_std_m"], pipeline["speed_mps"]
     parts = [machine, "no place" if std_m is None else f"+-{std_m:.2f} m  {abs(speed_mps):.1f} m/s"]
@@ -66,7 +66,7 @@ def line_of(machine: str, report: Mapping[str, Any]) -> str:
 
 
 def summary_of(machine: str, report: Mapping[str, Any]) -> str:
-    """How an agent's run ended, in sentences: what it read and made, what waits, and why."""
+    """The end of an agent's run in sentences: read, made, waiting, and why."""
     samples, waiting = report["samples"], report["spool"]["depth"] + report["spool"]["unsaved"]
     made = _counted(samples, "sample") if samples else "no samples"
     said = [f"{machine}: {_counted(report['readings'], 'reading')}, {made}"]
@@ -87,6 +87,6 @@ def _counted(n: int, what: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Text of others on one line, and not too long."""
+    """Foreign text on one line, truncated."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text[: 4 * MOST_CHARS]).split())
     return line if len(line) <= MOST_CHARS else f"{line[: MOST_CHARS - 1]}…"

@@ -1,4 +1,4 @@
-"""Events for a callback that may be slow: a slow callback of Zenoh itself stalls the session."""
+"""Events for slow callbacks: a slow callback of Zenoh itself stalls the session."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ import zenoh
 
 from protocol.errors import MessageError
 
-MOST_WAITING = 1000  # events; more are dropped
+MOST_WAITING = 1000  # capacity; further events are dropped
 T = TypeVar("T")
 log = logging.getLogger("sitegrid.listener")
 
 
 class Listener(Generic[T]):
-    """Calls `callback` with every event put on a key, one after the other, on a thread of its own, until closed.
+    """Calls `callback` with every event on a key, in order, on its own thread, until closed.
 
-    Events that cannot be read, or come faster than the callback returns, are dropped; its errors are logged.
-    refused: how many could not be read, by reason.
+    Unreadable and overflowing events are dropped; errors of the callback are logged. refused: unreadable events by
+    reason.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Listener(Generic[T]):
         self._subscriber = session.declare_subscriber(key, self._on_sample)
 
     def close(self) -> None:
-        """Stop listening; returns once the callback has. May be called again, and from the callback itself."""
+        """Stop listening and wait for the callback. Idempotent, and allowed inside the callback."""
         if self._closed:
             return
         self._closed = True
@@ -63,7 +63,7 @@ class Listener(Generic[T]):
                 self._callback(self._decode(*event))
             except MessageError as error:
                 self.refused[error.reason] += 1
-                if self.refused[error.reason].bit_count() == 1:  # the first, second, fourth...: who floods fills no log
+                if self.refused[error.reason].bit_count() == 1:  # 1st, 2nd, 4th...: a flood does not fill the log
                     log.warning("event refused key=%s reason=%s problem=%r", event[0], error.reason, str(error))
-            except Exception:  # the callback's bug is not the end of the events
+            except Exception:  # a bug in the callback does not end the events
                 log.exception("callback failed")

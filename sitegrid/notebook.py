@@ -1,6 +1,6 @@
-"""Answers in notebooks: a region as a dataset, table and plot, roads and changes as tables with geometries.
+"""Answers in notebooks: regions as dataset, table, plot; roads and changes as GeoDataFrames.
 
-xarray, pandas, geopandas, matplotlib and pyproj come with the extra `notebook`.
+Libraries come with the extra `notebook`.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from sitegrid.features.kinds import CHANGE, SEGMENT, WORK
 if TYPE_CHECKING:
     import geopandas
 
-UNITS = {"grade": "m/m", "heading": "rad", "weight": "m", "age": "s", "changed": "s"}  # by the first word; others: 1
+UNITS = {"grade": "m/m", "heading": "rad", "weight": "m", "age": "s", "changed": "s"}  # by first word; others: 1
 
 
 @dataclass(frozen=True, repr=False)
 class MapRegion(Region):
-    """A region that knows its site. site, where: ask for it, and where the map lies, where that is needed."""
+    """A region with its site. site, where: queried on demand."""
 
     site: Callable[[], SiteInfo] = field(kw_only=True, compare=False)
     where: Callable[[], str] = field(kw_only=True, compare=False)
 
     @classmethod
     def from_region(cls, region: Region, site: Callable[[], SiteInfo], where: Callable[[], str]) -> MapRegion:
-        """A region of a site."""
+        """Attach a site to a region."""
         return cls(**{one.name: getattr(region, one.name) for one in fields(Region)}, site=site, where=where)
 
     def __repr__(self) -> str:
@@ -57,12 +57,12 @@ class MapRegion(Region):
 
     @property
     def transform(self) -> tuple[float, float, float, float, float, float]:
-        """From column and row to `map`, as rasterio's Affine has it; rows go north, from the southernmost."""
+        """Affine from (column, row) to `map`, as in rasterio; rows go north."""
         edge = self.bounds
         return self.cell_m, 0.0, edge.west_m, 0.0, self.cell_m, edge.south_m
 
     def to_xarray(self) -> xarray.Dataset:
-        """A dataset of the layers over y and x, with units and the site's frame by the CF conventions."""
+        """Layers over y and x, with units and frame by the CF conventions."""
         import xarray
 
         axes = {
@@ -79,7 +79,7 @@ class MapRegion(Region):
         return xarray.Dataset(layers, {**axes, "spatial_ref": frame}, about)
 
     def to_pandas(self) -> pd.DataFrame:
-        """A row for each cell of which any layer is known: x_m, y_m of its centre, and the layers."""
+        """One row per cell with a known layer: centre x_m, y_m, and layers."""
         import pandas as pd
 
         y_m, x_m = np.meshgrid(self.y_m, self.x_m, indexing="ij")
@@ -88,7 +88,7 @@ class MapRegion(Region):
         return pd.DataFrame({name: values[known] for name, values in columns.items()})
 
     def plot(self, layer: str | None = None, axes: Any = None, **style: Any) -> Any:
-        """Draw one layer with matplotlib, by default the first; returns the axes. style: of `imshow`."""
+        """Draw one layer, by default the first, with matplotlib; returns the axes. style: of `imshow`."""
         from matplotlib import pyplot as plt
 
         name, edge = layer or next(iter(self.layers)), self.bounds
@@ -109,7 +109,7 @@ class MapRegion(Region):
 
 
 def unit_of(layer: str) -> str:
-    """The unit of a layer's values."""
+    """Unit of a layer's values."""
     return "1" if layer.endswith("_class") else UNITS.get(layer.partition("_")[0], "1")
 
 
@@ -122,7 +122,7 @@ def _summary(values: Any) -> tuple[str, str, str, str]:
 
 
 def to_geopandas(answer: Segments | Worklist | ChangesAnswer, crs: str) -> geopandas.GeoDataFrame:
-    """A row for each segment, stretch or change, with the columns that exported files have too."""
+    """One row per segment, worklist row or change, with the columns of exported files."""
     import geopandas
     from shapely.geometry import shape
 

@@ -1,4 +1,4 @@
-"""Times as people give them: ISO 8601, `datetime`, nanoseconds since 1970, or a duration before the site's now."""
+"""Times from people: ISO 8601, `datetime`, nanoseconds since 1970, or a duration before the site's now."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True)
 class SiteTime:
-    """ns: a stamp; from_now: counted from the site's now instead, and not above 0."""
+    """ns: a stamp; from_now: relative to the site's now, not positive."""
 
     ns: int
     from_now: bool = False
 
     def stamp(self, name: str, site_now_ns: Callable[[], int]) -> int:
-        """As a stamp. site_now_ns: asked only where it is needed; ConfigError names the option or argument."""
+        """As a stamp. site_now_ns: called if needed; ConfigError names the option or argument."""
         if not self.from_now:
             return self.ns
         now_ns = site_now_ns()
@@ -38,14 +38,14 @@ class SiteTime:
 
 
 def parse_time(time: Time) -> SiteTime:
-    """Read a time; ValueError where it is none."""
+    """Parse a time; ValueError if it is none."""
     if isinstance(time, str) and (ago := _AGO.fullmatch(time)):
         return SiteTime(-round(float(ago[1]) * _UNIT_S[ago[2]] * 1e9), from_now=True)
     return SiteTime(parse_stamp(time))
 
 
 def parse_stamp(time: Time) -> int:
-    """Read ISO 8601, UTC where no zone is named, or a stamp in ns; ValueError where it is neither."""
+    """Parse ISO 8601 (default zone UTC) or nanoseconds; ValueError otherwise."""
     if isinstance(time, datetime):
         ns = _ns(time)
     elif isinstance(time, int) or (time.isascii() and time.isdigit() and len(time) < 30):
@@ -58,14 +58,14 @@ def parse_stamp(time: Time) -> int:
 
 
 def utc_text(stamp_ns: int) -> str:
-    """A stamp as people read it, to the second; `never` for 0."""
+    """A stamp for people, to the second; `never` for 0."""
     if not stamp_ns:
         return "never"
     return (_EPOCH + timedelta(seconds=stamp_ns // 10**9)).strftime("%Y-%m-%d %H:%M:%SZ")
 
 
 def iso(stamp_ns: int) -> str | None:
-    """A stamp as ISO 8601 in UTC; None for 0, which is never."""
+    """ISO 8601 in UTC; None for 0, never."""
     if not stamp_ns:
         return None
     seconds, rest_ns = divmod(stamp_ns, 10**9)
@@ -81,4 +81,4 @@ def _iso_ns(text: str) -> int:
 
 def _ns(time: datetime) -> int:
     zoned = time if time.tzinfo else time.replace(tzinfo=UTC)
-    return (zoned - _EPOCH) // timedelta(microseconds=1) * 1000  # exact, where floating point would not be
+    return (zoned - _EPOCH) // timedelta(microseconds=1) * 1000  # exact, unlike floating point

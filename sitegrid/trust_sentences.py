@@ -1,4 +1,4 @@
-"""What an answer says of a machine, in words for people: why it is judged so, and how it is calibrated."""
+"""Trust and calibration of machines in words for people."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 from protocol.queries.answers import MachineState
 
-TORQUE_OFF, SURE = 0.05, 3.0  # a gain of the torque beyond it is more than data sheets allow; standard deviations
+TORQUE_OFF, SURE = 0.05, 3.0  # torque gain error beyond data sheets; in standard deviations
 MOST_LISTED = 12  # machines beside a picture
 
 
 def why(machine: MachineState) -> str:
-    """In what it contradicts the others or its data sheet, and what was decided about it; empty for nothing."""
+    """Contradictions to other machines or to its data sheet, and decisions; empty if none."""
     said = [*(_sentence(reason, machine.evidence) for reason in machine.reasons), pulls(machine), rolls(machine)]
     if machine.reason != ", ".join(machine.reasons):
         said.append(machine.reason)
@@ -22,7 +22,7 @@ def why(machine: MachineState) -> str:
 
 
 def pulls(machine: MachineState) -> str:
-    """How much its drive force reads too high or low by the ground, and why that may be; empty where it does not."""
+    """Error of the drive force against the ground and its possible causes; empty if insignificant."""
     known = machine.evidence
     with suppress(KeyError, TypeError, ValueError):
         off, std, is_known = known["torque_gain"] - 1, known["torque_gain_std"], known["torque_gain_by"]
@@ -33,9 +33,9 @@ def pulls(machine: MachineState) -> str:
 
 
 def rolls(machine: MachineState) -> str:
-    """How much harder or easier it rolls than the others, why that may be, and what it costs; empty where it does not.
+    """Difference in rolling resistance from the other machines, causes and cost; empty if insignificant.
 
-    Most may roll wrong alike: then the odd one is right, which nothing shows.
+    If most machines are wrong alike, the odd one is right; nothing shows that.
     """
     known = machine.evidence
     with suppress(KeyError, TypeError, ValueError):
@@ -47,7 +47,7 @@ def rolls(machine: MachineState) -> str:
 
 
 def _sentence(reason: str, evidence: Mapping[str, Any]) -> str:
-    """A reason with its figures; its name where it has none, or where a newer server says other things."""
+    """A reason with its figures; only its name if the server is newer."""
     with suppress(KeyError):
         match reason:
             case "gain":
@@ -65,7 +65,7 @@ def _sentence(reason: str, evidence: Mapping[str, Any]) -> str:
 
 
 def calibrated(machine: MachineState, name: str) -> str:
-    """The figure `zero` or `torque_gain`, how sure it is, and what shows it; empty where nothing is known."""
+    """The figure `zero` or `torque_gain`, its uncertainty and source; empty if unknown."""
     known = machine.evidence
     if name not in known:
         return ""
@@ -73,7 +73,7 @@ def calibrated(machine: MachineState, name: str) -> str:
 
 
 def calibrations(machines: Sequence[MachineState]) -> list[str]:
-    """Two lines for each machine that has a calibration which the ground shows, if they are not too many."""
+    """Two lines per machine whose calibration comes from the ground, up to MOST_LISTED."""
     known = [one for one in machines if one.evidence.get("zero_by") or one.evidence.get("torque_gain_by")]
     lines = []
     for machine in known[:MOST_LISTED]:

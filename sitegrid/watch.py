@@ -1,7 +1,4 @@
-"""The map as it changes: what differs since the last look, until a program has seen enough.
-
-What is missed while server or router are away is asked for again: the version of the last look says what that is.
-"""
+"""Watch the map: regions that changed since the last look. After an outage the last version says what was missed."""
 
 from __future__ import annotations
 
@@ -16,18 +13,18 @@ from protocol.queries.map_tiles import TILE_CELLS, MapTile, TilesAnswer, TilesQu
 from protocol.site.geometry import Bounds
 from sitegrid.follower_choice import ELSEWHERE
 
-AGAIN_S = 1.0  # between two looks, by default
-NEAR_TILES = 1  # layers of areas depend on cells so far away
+AGAIN_S = 1.0  # default interval
+NEAR_TILES = 1  # reach of area layers
 
 Ask = Callable[[TilesQuery], TilesAnswer]
 Read = Callable[[Bounds], Region]
 
 
 def watch(ask: Ask, read: Read, bounds: Bounds | None, again_s: float, stop: Event) -> Iterator[Region]:
-    """Regions of the tiles that differ, again and again; first of all that there are. Ends when `stop` is set.
+    """Regions of changed tiles, endlessly, first of all tiles; ends when `stop` is set.
 
-    ask: for tiles since a version. read: a region. bounds: of what is watched, None for all. A server that is away is
-    asked again; a QueryError about the question ends the watch.
+    ask: tiles since a version. read: a region. bounds: None: everywhere. Outages are retried; a QueryError about the
+    query is raised.
     """
     version: MapVersion | None = None
     while not stop.is_set():
@@ -46,13 +43,13 @@ def watch(ask: Ask, read: Read, bounds: Bounds | None, again_s: float, stop: Eve
 
 
 async def watch_async(regions: Iterator[Region]) -> AsyncIterator[Region]:
-    """The same for programs with an event loop, which does not wait for the server."""
+    """The same without blocking an event loop."""
     while (region := await asyncio.to_thread(next, regions, None)) is not None:
         yield region
 
 
 def _areas(answer: TilesAnswer, bounds: Bounds | None) -> Iterator[Bounds]:
-    """What is read: a rectangle for each row of tiles that differ, with those beside them."""
+    """One rectangle per row of changed tiles, with their neighbours."""
     edge_m = TILE_CELLS * answer.cell_m
     rows: dict[int, list[MapTile]] = {}
     for tile in answer.tiles:

@@ -1,4 +1,4 @@
-"""The whole answer to a query, however many replies it comes in."""
+"""Complete answers to queries that come in several replies."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from protocol.queries.requests import ChangesQuery, PieceQuery, RegionQuery
 from sitegrid.follower_choice import Answered
 
 REGION_ATTEMPTS = 3
-Ask = Callable[[MapQuery[Any], Origin | None], Answered]  # one reply, from a certain process where one is named
+Ask = Callable[[MapQuery[Any], Origin | None], Answered]  # one reply, from a certain process if given
 T = TypeVar("T")
-Progress = Callable[[int, int], object]  # how many pieces of how many are here
+Progress = Callable[[int, int], object]  # pieces received, total
 
 
 def whole_answer(query: MapQuery[T], ask: Ask, progress: Progress | None = None) -> T:
-    """All of an answer; progress: called with each piece of a large region, as (here, of all)."""
+    """The complete answer; progress: called per piece of a large region with (received, total)."""
     answer: Any
     match query:
         case RegionQuery():
@@ -47,13 +47,13 @@ def _region(query: RegionQuery, ask: Ask, progress: Progress | None) -> Region:
         try:
             return joined(_pieces(query, ask), progress)
         except QueryError as error:
-            if error.reason != Refusal.EXPIRED:  # else that version of the map is not kept any more: begin again
+            if error.reason != Refusal.EXPIRED:  # else this version is no longer kept: start again
                 raise
     return joined(_pieces(query, ask), progress)
 
 
 def _pieces(query: RegionQuery, ask: Ask) -> Iterator[Region]:
-    """The region, or piece after piece of it, all from whom has the first one."""
+    """The region or its pieces, all from one process."""
     answered = ask(query, None)
     yield (first := query.decode(answered.data))
     if first.piece:
@@ -63,7 +63,7 @@ def _pieces(query: RegionQuery, ask: Ask) -> Iterator[Region]:
 
 
 def _tiles(query: TilesQuery, ask: Ask) -> TilesAnswer:
-    """Tiles in several replies. What changes meanwhile may be in it, and differs since the answer's version."""
+    """Tiles from several replies; changes meanwhile may be in it, and differ again since its version."""
     first = answer = _reply(query, ask)
     tiles = list(first.tiles)
     while answer.next_place:
@@ -83,16 +83,16 @@ def _changes(query: ChangesQuery, ask: Ask) -> ChangesAnswer:
 
 
 def _goes_back(first: TilesAnswer, answer: TilesAnswer) -> bool:
-    """Whether another store, or a process that is behind the first one, answers the rest of the tiles."""
+    """Whether the rest comes from another store, or from a process behind the first."""
     before, now = first.version, answer.version
     same = (before.store, first.whole) == (now.store, answer.whole)
     return not same or now.row < before.row or now.fact < before.fact
 
 
 def joined(pieces: Iterable[Region], progress: Progress | None = None) -> Region:
-    """The region that pieces make up, each held only until it is copied; one without `piece` is a region.
+    """Join pieces, each held only until copied; a region without `piece` is returned as is.
 
-    Raises MessageError where they do not fit together.
+    MessageError if they do not fit together.
     """
     regions = iter(pieces)
     first = next(regions)
@@ -126,6 +126,6 @@ def _placed(first: Region, others: Iterator[Region]) -> Iterator[tuple[Region, P
 
 
 def _identity(region: Region) -> tuple[object, ...]:
-    """What is the same in all pieces of a region."""
+    """The common part of all pieces of a region."""
     piece = region.piece and (region.piece.cursor, region.piece.columns, region.piece.rows)
     return tuple(region.layers), region.cell_m, region.version, region.stamp_ns, piece

@@ -1,1 +1,1 @@
-"""A benchmark that others can enter: recordings with truth, rules (README.md), baselines, and the table."""
+"""A public benchmark: recordings with truth, rules (README.md), baselines, table."""

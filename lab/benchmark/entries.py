@@ -1,4 +1,4 @@
-"""Files that others enter: a map or samples for each recording, checked line by line before anything is scored."""
+"""Files of entries: a map or samples per recording, validated line by line before scoring."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from sim.truth import TruthMap
 
 PLACE = ("x_m", "y_m")
 VALUES = ("resistance", "grade_east", "grade_north")
-ENCODING = "utf-8-sig"  # spreadsheets begin a file with a byte-order mark
-CONFIDENCE = "confidence"  # a column that a map may have
-BOUNDS = {**dict.fromkeys(VALUES, (-100.0, 100.0)), CONFIDENCE: (0.0, 1.0)}  # beyond them no errors could be added up
+ENCODING = "utf-8-sig"  # spreadsheets write a byte-order mark
+CONFIDENCE = "confidence"  # optional column of a map
+BOUNDS = {**dict.fromkeys(VALUES, (-100.0, 100.0)), CONFIDENCE: (0.0, 1.0)}  # larger values would break sums of errors
 EXTENT_M = SiteConfig.extent_m  # from the origin
-# Metres that samples stand for, against the line through their places: 0.98 to 1.02 of those that agents make.
+# Metres of samples over the length of their track: agents' samples have 0.98 to 1.02.
 MOST_METRES, SPARE_M = 1.1, 10.0
 
 
 def is_samples(path: Path) -> bool:
-    """Whether a file has samples, not a map, by its header; a ConfigError where it has not all columns of either."""
+    """Whether a file has samples rather than a map, by its header; ConfigError without all columns of either."""
     header = _header(path)
     if MACHINE in header:
         _require_columns(path, header, (MACHINE, *COLUMNS))
@@ -38,10 +38,10 @@ def is_samples(path: Path) -> bool:
 
 
 def read_map(path: Path, truth: TruthMap) -> Layers:
-    """Layers (rows, columns) of a map file over the cells of a site; cells that it does not name are unknown.
+    """Layers (rows, columns) of a map file on a site's cells; unnamed cells are unknown.
 
-    Places outside of the site do not count: nobody knows where it ends. A ConfigError names the line of a value that is
-    none and of a cell that comes twice, or says that no place is on the site.
+    Places off the site are ignored: its extent is not published. ConfigError names the line of an invalid value or
+    repeated cell, or says that no place is on the site.
     """
     rows, columns = truth.c_rr.shape
     names = [*VALUES, *([CONFIDENCE] if CONFIDENCE in _header(path) else [])]
@@ -68,10 +68,9 @@ def read_map(path: Path, truth: TruthMap) -> Layers:
 
 
 def read_samples(path: Path, machines: Collection[str]) -> dict[str, Table]:
-    """Samples by machine, of those of a recording; a ConfigError names the line or the field that is wrong.
+    """Samples by machine of a recording; ConfigError names the wrong line or field.
 
-    A stamp of a machine comes once, and samples stand for no more metres than lie between their places: who weighs more
-    is not more right.
+    Stamps of a machine are unique, and samples weigh no more metres than their track: weight must not buy influence.
     """
     rows: dict[str, list[tuple[float, ...]]] = {}
     for where, line in _lines(path, (MACHINE, *COLUMNS)):
@@ -90,7 +89,7 @@ def read_samples(path: Path, machines: Collection[str]) -> dict[str, Table]:
 
 
 def _check_weights(path: Path, name: str, table: Table) -> None:
-    """ConfigError where samples (n,) in the order of their stamps weigh more than their machine drove."""
+    """ConfigError if samples (n,), sorted by stamp, weigh more than the machine drove."""
     again = np.flatnonzero(np.diff(table[COLUMNS[0]]) == 0)
     if len(again):
         raise ConfigError(path, f"machine {name}: {COLUMNS[0]} {table[COLUMNS[0]][again[0]]} comes twice")
@@ -102,7 +101,7 @@ def _check_weights(path: Path, name: str, table: Table) -> None:
 
 
 def _lines(path: Path, names: Sequence[str]) -> Iterator[tuple[str, dict[str, str]]]:
-    """The lines of a file after its header, each with where it is; a ConfigError where a column is missing."""
+    """Lines after the header, with their place; ConfigError if a column is missing."""
     header = _header(path)
     _require_columns(path, header, names)
     number = 1
@@ -123,7 +122,7 @@ def _lines(path: Path, names: Sequence[str]) -> Iterator[tuple[str, dict[str, st
 
 
 def _require_columns(path: Path, header: Sequence[str], names: Sequence[str]) -> None:
-    """ConfigError where columns are missing, or there twice."""
+    """ConfigError for missing or repeated columns."""
     if not header:
         raise ConfigError(path, "is empty; its first line names the columns")
     if missing := [name for name in names if name not in header]:
@@ -134,7 +133,7 @@ def _require_columns(path: Path, header: Sequence[str], names: Sequence[str]) ->
 
 
 def _number(where: str, line: Mapping[str, str], name: str) -> float:
-    """A number; NaN where there is nothing. Infinite ones are refused."""
+    """A finite number; NaN for an empty field."""
     text = line[name].strip()
     try:
         value = float(text or "nan")

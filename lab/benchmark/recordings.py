@@ -1,4 +1,4 @@
-"""The recordings of the benchmark: made from seeds, with the samples of this project's agents and published hashes."""
+"""The benchmark's recordings: simulated from seeds, with our agents' samples and published hashes."""
 
 from __future__ import annotations
 
@@ -25,37 +25,37 @@ from protocol.machine.samples import COLUMNS
 from sim.scenario.file import load_scenario
 from sitegrid.proof.figures import Report, Row
 
-HASHES = Path(__file__).parent / "hashes.json"  # of the parts of all recordings, by name, as they were published
+HASHES = Path(__file__).parent / "hashes.json"  # published hashes by recording and part
 SAMPLES_FILE = "samples.csv"
-MADE_FILE = "made.json"  # hashes of the parts of a recording, once all of it is there
+MADE_FILE = "made.json"  # hashes of a recording's parts, written when complete
 PARTS = ("logs", "truth", SAMPLES_FILE)
 READ_BY_SCORES = PARTS[1:]
 AGAIN = "delete the folder of the recording, and make it again"
-MACHINE = "machine"  # column of a samples file before those of a sample
+MACHINE = "machine"  # first column of a samples file
 NAMES = ("paper_site", "loading", "haul_road_driven")
-FIRST_SEED, SEEDS = 2000, 8  # nothing is developed or judged on these
+FIRST_SEED, SEEDS = 2000, 8  # never used for development or judgement
 SECONDS = 600.0
 LOADERS = 4  # on the paper's site
 
 
 @dataclass(frozen=True)
 class BenchDrive(FleetDrive):
-    """One recording. It lies in a folder of its plain name: what it has to be, its hash says."""
+    """One recording, in a folder of its plain name; its hash identifies it."""
 
     @property
     def name(self) -> str:
-        """For people, and of its folder; shorter recordings have names of their own."""
+        """Name for people and its folder; shorter recordings differ."""
         length = "" if self.seconds == SECONDS else f"-{self.seconds:g}s"
         return f"{self.setup.scenario}-{self.seed}{length}"
 
     def folder(self, cache_dir: Path) -> Path:
-        """Where it lies."""
+        """Its folder."""
         return cache_dir / self.name
 
 
 @dataclass(frozen=True)
 class Edition:
-    """What is recorded: so many seeds of each scenario, for so many seconds; world: over the scenarios'."""
+    """Scope of recordings: seeds per scenario, seconds each. world: overrides the scenarios'."""
 
     names: Sequence[str] = NAMES
     seeds: int = SEEDS
@@ -79,10 +79,10 @@ QUICK = Edition(("paper_site", "loading"), seeds=1, seconds=60.0, world="fast")
 
 
 def make(runner: Runner, edition: Edition) -> list[Row]:
-    """Record what is not recorded, and write the samples; a row per recording, with hashes and whether they are right.
+    """Make missing recordings and samples; a row per recording with hashes and their verdict.
 
-    published: whether all parts are those that were published; None where none were, as of a shorter edition. A
-    ConfigError names a recording that is no longer what was made.
+    published: whether all parts match the published ones; None if the edition has none. ConfigError names a recording
+    that changed since it was made.
     """
     planned = edition.drives
     for drive in planned:
@@ -106,7 +106,7 @@ def _agents(drive: FleetDrive) -> list[Agent]:
 
 
 def machine_names(folder: Path) -> list[str]:
-    """The machines of a recording."""
+    """Machines of a recording."""
     return sorted(path.name for path in (folder / "logs").iterdir() if path.is_dir())
 
 
@@ -123,20 +123,20 @@ def _row(drive: BenchDrive, hashes: Mapping[str, str], edition: Edition) -> Row:
 
 
 def edition_key(edition: Edition) -> str:
-    """Its name among the published hashes."""
+    """Key of an edition among the published hashes."""
     return f"{edition.seconds:g} s {edition.world or 'as scenarios have it'}"
 
 
 def published_hashes() -> dict[str, dict[str, dict[str, str]]]:
-    """Hashes of the parts of each recording, by edition and name."""
+    """Published hashes by edition, recording and part."""
     hashes: dict[str, dict[str, dict[str, str]]] = json.loads(HASHES.read_text(encoding="utf-8"))
     return hashes
 
 
 def part_hash(folder: Path, part: str) -> str:
-    """SHA-256 of names and contents of the files of one of PARTS, the same in whatever order they come.
+    """SHA-256 of a part's file names and contents, independent of their order.
 
-    Of an archive of arrays its numbers count, since it has the time in it.
+    Archives of arrays count by their numbers, because they contain the time.
     """
     at = folder / part
     total = hashlib.sha256()
@@ -146,7 +146,7 @@ def part_hash(folder: Path, part: str) -> str:
 
 
 def _content_hash(path: Path) -> str:
-    """Of one file; of an archive that cannot be read its bytes."""
+    """One file's hash; of an unreadable archive, its bytes."""
     if path.suffix != ".npz":
         return hashlib.sha256(path.read_bytes()).hexdigest()
     total = hashlib.sha256()
@@ -165,7 +165,7 @@ def _content_hash(path: Path) -> str:
 
 
 def write_samples(path: Path, rows: Mapping[str, Table]) -> None:
-    """Write the samples of all machines as CSV, machine by machine, each number as short as it is exact."""
+    """Write all machines' samples as CSV, with shortest exact numbers."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([MACHINE, *COLUMNS])
@@ -176,7 +176,7 @@ def write_samples(path: Path, rows: Mapping[str, Table]) -> None:
 
 
 def require_made(drive: BenchDrive, cache: Path) -> None:
-    """ConfigError where a recording is not there whole, or what scores read of it is not what was made."""
+    """ConfigError if a recording is incomplete, or what scores read was changed."""
     folder = drive.folder(cache)
     if not (folder / MADE_FILE).is_file():
         quick = " --quick" if drive.seconds < SECONDS else ""
@@ -188,7 +188,7 @@ def require_made(drive: BenchDrive, cache: Path) -> None:
 
 
 def require_parts(folder: Path, parts: Sequence[str]) -> None:
-    """ConfigError where parts of a recording are no longer what was made."""
+    """ConfigError if parts changed since they were made."""
     try:
         made = json.loads((folder / MADE_FILE).read_text(encoding="utf-8"))
         changed = [part for part in parts if made[part] != part_hash(folder, part)]
@@ -202,7 +202,7 @@ def require_parts(folder: Path, parts: Sequence[str]) -> None:
 
 
 def publish(made: Report) -> None:
-    """Take the hashes of a report of `python -m lab bench make --json` as those of its edition."""
+    """Publish the hashes in a report of `python -m lab bench make --json` for its edition."""
     hashes = {row["name"]: {part: row[part] for part in PARTS} for row in made["rows"]}
     write_whole(HASHES, f"{json.dumps({**published_hashes(), made['edition']: hashes}, indent=1)}\n".encode())
 

@@ -1,4 +1,4 @@
-"""The rules of the benchmark: what a map is worth, over the cells that machines truly passed, and the baselines."""
+"""Rules of the benchmark: scores of maps over truly driven cells, and the baselines."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from protocol.site.ground_classes import UNKNOWN, resistance_class
 from sitegrid.proof.figures import Report, Row, half_width, root_mean_square, rounded
 from sitegrid.proof.map_score import border_distance, driven_cells, score_driven
 
-# The map server with its own calibration of machines: what is known, and with its gaps filled.
+# The self-calibrating map server: known cells, and with filled gaps.
 OURS, FILLED = "soft_votes", "soft_votes_filled"
-INTERIOR_M = 2.0  # from a border; nearer to one, 1 m of the position decides
-# Of one recording, over driven cells. right_pct is what entries are ordered by: nobody gains by leaving cells out.
+INTERIOR_M = 2.0  # from a border; nearer cells depend on 1 m of position
+# Per recording, over driven cells. Entries are ranked by right_pct, so omitting cells never pays.
 FIGURES = (
     "right_pct",
     "wrong_resistance_pct",
@@ -42,18 +42,18 @@ FIGURES = (
 )
 DIGITS = 3
 FILLING = tuple(AREA_LAYERS[f"{name}_filled"] for name in VALUES)
-GROUND = tuple(dict.fromkeys(name for layer in FILLING for name in layer.needs))  # that gaps are filled from
+GROUND = tuple(dict.fromkeys(name for layer in FILLING for name in layer.needs))  # inputs of gap filling
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What takes part: a baseline, by its name, or a folder with a file NAME.csv for each recording."""
+    """A baseline by name, or a folder with NAME.csv per recording."""
 
     name: str
     folder: Path | None = None
 
     def layers(self, drive: BenchDrive, cache: Path, true: Scene) -> Layers:
-        """Its map of a recording; samples that it has instead go through the map server."""
+        """Its map of a recording; samples instead of a map go through the map server."""
         path = self.folder / f"{drive.name}.csv" if self.folder else drive.folder(cache) / SAMPLES_FILE
         if self.folder and not is_samples(path):
             return read_map(path, true.truth)
@@ -66,7 +66,7 @@ class Entry:
 
 
 def gaps_filled(layers: Layers) -> Layers:
-    """VALUES as the map server fills gaps between cells of GROUND."""
+    """VALUES with gaps filled as by the map server."""
     read = ServerConfig().read
     area = Area(layers, CELL_M, read.fill_reach_m, read.boundaries)
     return {name: layer.derive(area) for name, layer in zip(VALUES, FILLING, strict=True)}
@@ -82,7 +82,7 @@ def run(
     processes: int,
     on_progress: Callable[[float, float, str], None] = lambda *_: None,
 ) -> Report:
-    """Score the baselines and the entries of some folders on all recordings of an edition; best first."""
+    """Score baselines and folders of entries on an edition; best first."""
     entries = [*BASELINES, *(Entry(folder.resolve().name, folder) for folder in folders)]
     drives = edition.drives
     for drive in drives:
@@ -99,7 +99,7 @@ def run(
 
 
 def _check_entries(entries: Sequence[Entry], drives: Sequence[BenchDrive]) -> None:
-    """ConfigError for a name that comes twice, and for a file that is missing or has not its columns."""
+    """ConfigError for duplicate names, missing files or columns."""
     names = [entry.name for entry in entries]
     for entry in entries:
         if not entry.folder:
@@ -120,7 +120,7 @@ def _score(job: tuple[Entry, BenchDrive, Path]) -> Row:
 
 
 def figures_of(layers: Layers, true: Scene) -> Row:
-    """FIGURES of one map; NaN where nothing is to be judged, None where it says nothing about it."""
+    """FIGURES of one map; NaN: nothing to judge, None: not stated by the map."""
     truth, tracks_m = true_layers(true.truth), [track.place_m for track in true.tracks.values()]
     region = region_of(true.truth, {name: layers[name] for name in VALUES})
     driven = score_driven(region, truth, tracks_m)
@@ -144,14 +144,14 @@ def figures_of(layers: Layers, true: Scene) -> Row:
 
 
 def _believed(layers: Layers, known: Bools, right: Bools) -> Believed | None:
-    """Confidence of the known cells, where a map states any; a cell without is as sure as a coin of two."""
+    """Stated confidence of known cells; 0.5 where missing."""
     if CONFIDENCE not in layers or not np.isfinite(layers[CONFIDENCE]).any() or not known.any():
         return None
     return Believed(np.nan_to_num(layers[CONFIDENCE][known], nan=0.5), right[known])
 
 
 def summarise(entry: Entry, figures: Mapping[str, Row]) -> Row:
-    """One row of the table: means over the recordings, the interval of what orders them, and all recordings."""
+    """Table row: means over recordings, interval of the ranking figure, and all recordings."""
     row: Row = {"entry": entry.name}
     for name in FIGURES:
         values = [each[name] for each in figures.values()]

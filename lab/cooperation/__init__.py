@@ -1,1 +1,1 @@
-"""What machines gain that draw one map together: real agents and a real map server, on recordings of one site."""
+"""The benefit of a shared map: real agents and map server on recordings of one site."""

@@ -1,8 +1,8 @@
-"""What is driven, and the arms that are compared: who drives, over which links, and who is not as the others are.
+"""Drives and arms of the comparison: machines, links, and one deviating machine.
 
-There are four tours of the paper's site, driven by one machine in turn or by up to eight at once. All tours go the same
-way over one stretch, so that tours one after the other are one closed tour: a lone machine drives those of all others
-without a detour, and what it needs longer is what others would have driven for it.
+Four tours of the paper's site, driven in turn by one machine or by up to eight at once. All share one stretch in one
+direction, so a lone machine drives them as one closed tour without detour; its extra time is what the others would
+drive.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from sitegrid.proof.tracks import read_track
 from tests.tcp_proxy import FAIR, Weather
 
 SITE = "paper_site"
-SHARED: Corners = ((96, 50), (96, 82))  # the stretch
-# Corners beyond it, round to its begin: concrete and gravel, sand, the slope in dry ground, the slope in wet dirt.
+SHARED: Corners = ((96, 50), (96, 82))  # the shared stretch
+# Corners beyond the stretch: concrete and gravel, sand, the slope in dry dirt, the slope in wet dirt.
 TOURS: dict[str, Corners] = {
     "west": ((82, 88), (44, 84), (26, 66), (24, 30), (38, 15), (80, 16), (90, 28)),
     "north": ((98, 112), (84, 130), (40, 134), (18, 118), (20, 98), (34, 72), (56, 52), (82, 38)),
@@ -40,7 +40,7 @@ TOURS: dict[str, Corners] = {
 }
 ROUNDING_M = 7.0
 DRIVE_MPS = 4.0
-# Ground that is repaved: around the shared stretch, and where one tour alone goes.
+# Repaved ground: around the shared stretch, and on one tour alone.
 REPAVED: dict[str, tuple[Point, ...]] = {
     "shared": ((82, 46), (112, 46), (112, 84), (82, 84)),
     "west": ((14, 28), (36, 28), (36, 62), (14, 62)),
@@ -50,7 +50,7 @@ PAVED_WITH = {"shared": "dry concrete", "west": "gravel"}
 
 @dataclass(frozen=True)
 class Crew:
-    """Machines of one model. tours: which they drive, in turn; each may be several, one after the other."""
+    """Machines of one model. tours: assigned in turn, each a sequence of tours."""
 
     name: str
     count: int
@@ -68,14 +68,14 @@ MIXED = (Crew("loader", 2, EACH[::2]), Crew("truck", 2, EACH[1::2], "dump_truck"
 
 @dataclass(frozen=True)
 class SharedDrive(PlannedDrive):
-    """Machines that start together. repaves: whether ground is repaved at half time."""
+    """Machines that start together. repaves: ground is repaved at half time."""
 
     crews: tuple[Crew, ...] = FOUR
     repaves: bool = False
 
     @property
     def scenario_toml(self) -> str:
-        """The scenario file of this drive."""
+        """Scenario file."""
         tours = dict.fromkeys(names for crew in self.crews for names in crew.tours)
         tables = [toml_of({"base": self.setup.scenario, "world": self.setup.world})]
         for names in tours:
@@ -90,49 +90,49 @@ class SharedDrive(PlannedDrive):
 
     @property
     def changes(self) -> dict[str, ScheduledChange]:
-        """The ground that is repaved, by its name."""
+        """Repaved ground by name."""
         if not self.repaves:
             return {}
         return {name: ScheduledChange(self.seconds / 2, PAVED_WITH[name], outline) for name, outline in REPAVED.items()}
 
     @property
     def machines(self) -> tuple[str, ...]:
-        """Names of all, in the order in which the simulator numbers them."""
+        """Names in the simulator's order."""
         return tuple(f"{crew.name}-{i + 1}" for crew in self.crews for i in range(crew.count))
 
     @property
     def tours(self) -> dict[str, tuple[str, ...]]:
-        """What each machine drives, by its name."""
+        """Tours by machine."""
         turns = [crew.tours[i % len(crew.tours)] for crew in self.crews for i in range(crew.count)]
         return dict(zip(self.machines, turns, strict=True))
 
     @property
     def ground(self) -> GroundConfig:
-        """The ground before anything is repaved."""
+        """Ground before repaving."""
         return load_scenario(self.setup.scenario).ground
 
 
 def planned(
     seed: int, seconds: float, crews: tuple[Crew, ...], world: str | None, *, repaves: bool = False
 ) -> SharedDrive:
-    """A drive of the site with the sensors that its scenario has."""
+    """A drive with the scenario's sensors."""
     return SharedDrive(seed, seconds, "dgps", Setup(SITE, (), (), (), world=world), crews, repaves)
 
 
 def corners(names: Sequence[str]) -> Corners:
-    """Corners of tours one after the other; it begins far from the shared stretch, where no two would start."""
+    """Corners of consecutive tours, starting far from the shared stretch, where starts would collide."""
     whole = [point for name in names for point in (*SHARED, *TOURS[name])]
     begin = 2 + len(TOURS[names[0]]) // 2
     return (*whole[begin:], *whole[:begin])
 
 
 def lines() -> dict[str, Leg]:
-    """The line of each tour."""
+    """Line of each tour."""
     return {name: _leg(tour(corners((name,)), ROUNDING_M)) for name in TOURS}
 
 
 def length_m(names: Sequence[str]) -> float:
-    """Length of one round of tours one after the other."""
+    """Length of one round."""
     return tour(corners(names), ROUNDING_M).length_m
 
 
@@ -142,7 +142,7 @@ def _leg(route: Route) -> Leg:
 
 
 def points(leg: Leg) -> Floats:
-    """A closed line (k, 2) whose last point is its first."""
+    """A closed line (k, 2), last point equal to the first."""
     return np.vstack([leg.points, leg.points[:1]])
 
 
@@ -152,14 +152,14 @@ def points(leg: Leg) -> Floats:
 OUTAGE_S, PERIOD_S = 60.0, 300.0  # one minute in five
 KBIT_PER_S = 300.0
 BAD, STANDALONE = "bad", "standalone"
-SPEED = 8.0  # of replays: two cores run four agents 15 times as fast as logs are
+SPEED = 8.0  # of replays: two cores run four agents at 15 times real time
 
 
 @dataclass(frozen=True)
 class Link:
-    """The link of each machine to the router, in the log's time. outage_s: of every period_s, by turns of the machines.
+    """Link of each machine, in the log's time. outage_s: per period_s, machines in turn.
 
-    kbit_per_s: so much in each direction, 0 for any.
+    kbit_per_s: in each direction, 0: unlimited.
     """
 
     name: str
@@ -167,7 +167,7 @@ class Link:
     kbit_per_s: float = 0.0
 
     def weather(self, turn: int, time_s: float, speed: float) -> Weather:
-        """What it is like for the machine of this turn after so many seconds of its log, replayed so fast."""
+        """Link quality for the machine of this turn at a log time, replayed at `speed`."""
         if self.outage_s and (time_s - turn * OUTAGE_S) % PERIOD_S >= PERIOD_S - self.outage_s:
             return Weather(cut=True)
         return Weather(bytes_per_s=speed * self.kbit_per_s * 1000 / 8) if self.kbit_per_s else FAIR
@@ -178,9 +178,9 @@ ALWAYS, LOST, SLOW = Link("always"), Link("lost", outage_s=OUTAGE_S), Link("slow
 
 @dataclass(frozen=True)
 class Arm:
-    """What is compared. crews: of the recording, of which so many machines take part, the first ones.
+    """An arm. crews: of the recording; its first `machines` take part.
 
-    seconds: of the recording. spoiled: what is wrong with the last machine, BAD or STANDALONE. speed: of the replay.
+    seconds: of the recording. spoiled: the last machine's defect, BAD or STANDALONE. speed: of the replay.
     """
 
     name: str
@@ -198,14 +198,14 @@ class Arm:
         return planned(seed, self.seconds, self.crews, self.world, repaves=self.repaves)
 
     def names(self, drive: SharedDrive) -> tuple[str, ...]:
-        """Those who take part."""
+        """Participants."""
         return drive.machines[: self.machines]
 
 
 def arms(whole_s: float, world: str | None = None) -> tuple[Arm, ...]:
-    """All arms. whole_s: of a lone machine's recording, which has three rounds of all tours or more.
+    """All arms. whole_s: a lone machine's recording, at least three rounds of all tours.
 
-    Two machines drive for 3/5 of that time, more machines for 9/20: six rounds and more of one tour each.
+    Two machines drive 3/5 of it, more machines 9/20: at least six rounds of one tour each.
     """
     four = Arm("four", EIGHT, 4, 0.45 * whole_s, SPEED, world=world)
     return (
@@ -226,7 +226,7 @@ def arms(whole_s: float, world: str | None = None) -> tuple[Arm, ...]:
 
 
 def logs_of(arm: Arm, drive: SharedDrive, cache: Path, scratch: Path) -> Iterator[tuple[str, Path]]:
-    """The machines of an arm, and the log folder of each; that of a spoiled one is written to `scratch`."""
+    """Machines of an arm with their log folders; a spoiled log is written to `scratch`."""
     folder = drive.folder(cache)
     names = arm.names(drive)
     for name in names:
@@ -252,9 +252,9 @@ def _write_spoiled(arm: Arm, drive: SharedDrive, folder: Path, name: str, to: Pa
 def uncorrected(
     recorded: RecordedDrive, motion: TrueMotion, seed: int, number: int
 ) -> tuple[MachineConfig, tuple[Reading, ...]]:
-    """The same drive with receivers that no station corrects, and the machine as it is configured for these.
+    """The drive with uncorrected receivers, and the machine configured for them.
 
-    number: the machine's place in its fleet, by which errors are drawn.
+    number: index in the fleet, which selects the errors.
     """
     noise = load_preset(STANDALONE).gps
     share = noise.drift_std_m**2 / (noise.drift_std_m**2 + noise.white_std_m**2)
@@ -269,7 +269,7 @@ def uncorrected(
 
 
 def _motion(track: Path) -> TrueMotion:
-    """The true motion of one machine of several."""
+    """True motion of one machine."""
     table = np.genfromtxt(track, delimiter=",", names=True, dtype=None)
     angles = [np.unwrap(table[name]) for name in ("roll", "pitch", "yaw")]
     position_m = np.stack([table[name] for name in "xyz"], axis=1)

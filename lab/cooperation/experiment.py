@@ -1,4 +1,4 @@
-"""What cooperation brings: how soon a map is there, and how good, by number of machines, by links and by troubles."""
+"""Benefit of cooperation: time and quality of the map by number of machines, links and faults."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from sitegrid.proof.figures import Report, Row, half_width, rounded
 WHOLE_S, LEAST_S = 1200.0, 300.0  # of a lone machine's recording
 ALONE = "one"
 DIGITS = 4
-DECIDED = ("c_rr_pct", "grade_pct")  # that are shown with what was decided in the end, too
+DECIDED = ("c_rr_pct", "grade_pct")  # also reported with the final decisions
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run. central: the arm whose machines also run in one process."""
+    """Scope. central: the arm that also runs in one process."""
 
     seeds: Sequence[int]
     arms: tuple[Arm, ...]
@@ -38,19 +38,19 @@ class Plan:
 
     @classmethod
     def full(cls, seeds: Sequence[int], whole_s: float = WHOLE_S) -> Plan:
-        """All arms; SitegridError where recordings would be too short."""
+        """All arms; SitegridError if recordings are too short."""
         if whole_s < LEAST_S:
             raise SitegridError(f"seconds: {whole_s:g} is too short; a round of all tours takes {LEAST_S:g} s")
         return cls(seeds, arms(whole_s))
 
 
-# Two machines for 75 s in the fast world: to see that all of it works.
+# Smoke test: two machines for 75 s in the fast world.
 QUICK = Plan((0,), (Arm("two", TWO, 2, 75.0, 16.0, world="fast"),), "two")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One arm, seed by seed: what ran, None of one process with a perfect link, and its figures."""
+    """One arm by seed: live run, None for one process with a perfect link, and figures."""
 
     judging: Judging
     runs: Sequence[LiveRun | None]
@@ -58,14 +58,14 @@ class Outcome:
 
 
 def run(runner: Runner, plan: Plan) -> tuple[Report, Sequence[Outcome]]:
-    """Record, run every arm live, one at a time, and judge."""
+    """Record, run the arms live one after another, and judge."""
     pairs = [(arm, seed) for seed in plan.seeds for arm in plan.arms]
     runner.record(list(dict.fromkeys(arm.drive(seed) for arm, seed in pairs)))
     apart = [arm for arm in plan.arms if arm.name == plan.central]
     runner.run(
         fleet_drives.EXPERIMENT, [task for arm in apart for seed in plan.seeds for task in central_tasks(arm, seed)]
     )
-    alone = replace(runner, processes=1)  # an arm has all cores: its times are those of its processes
+    alone = replace(runner, processes=1)  # an arm needs all cores for valid times
     runs = alone.run(live.EXPERIMENT, [replay_task(arm, arm.drive(seed)) for arm, seed in pairs])
     by_pair = dict(zip(pairs, runs, strict=True))
     judgings = [*(Judging(arm) for arm in plan.arms), *(Judging(arm, central=True) for arm in apart)]
@@ -83,7 +83,7 @@ def run(runner: Runner, plan: Plan) -> tuple[Report, Sequence[Outcome]]:
 
 
 def report(plan: Plan, outcomes: Sequence[Outcome]) -> Report:
-    """All tables, and the goals for those that there are."""
+    """All tables, and the available goals."""
     rows = [arm_row(each) for each in outcomes]
     speedups = speedup_rows(rows)
     rounds = [row for each in outcomes if not each.judging.central for row in round_rows(each)]
@@ -112,7 +112,7 @@ def report(plan: Plan, outcomes: Sequence[Outcome]) -> Report:
 
 
 def arm_row(outcome: Outcome) -> Row:
-    """One arm: means over the seeds; minutes are NaN where SHARE_PCT was not covered in all of them."""
+    """One arm: means over seeds; minutes are NaN unless all reached SHARE_PCT."""
     arm, scored = outcome.judging.arm, outcome.scored
     by_seed = [
         {
@@ -129,7 +129,7 @@ def arm_row(outcome: Outcome) -> Row:
 
 
 def _link_figures(outcome: Outcome) -> Row:
-    """What a machine's link carried in an hour of its work, and how the replay went; None of one process."""
+    """Traffic of a machine's link per hour, and quality of the replay; None for one process."""
     runs, arm = [each for each in outcome.runs if each], outcome.judging.arm
     names = ("sent_mb_per_h", "received_mb_per_h", "delivered", "late_s", "same_pct")
     same = mean([each.same_pct for each in outcome.scored])
@@ -145,7 +145,7 @@ def _link_figures(outcome: Outcome) -> Row:
 
 
 def _over_time(scored: Sequence[Scored]) -> list[Row]:
-    """FIGURES by stamps and the share that is covered by arrival, at each step, means over the seeds."""
+    """Means over seeds at each step: FIGURES by stamp, coverage by arrival."""
     with np.errstate(invalid="ignore"):
         stamped, arrived = (
             np.mean([getattr(each, name) for each in scored], axis=0) for name in ("by_stamp", "by_arrival")
@@ -157,7 +157,7 @@ def _over_time(scored: Sequence[Scored]) -> list[Row]:
 
 
 def speedup_rows(rows: Sequence[Row]) -> list[Row]:
-    """How many times sooner than a lone machine each arm has covered SHARE_PCT, paired; NaN where one never had."""
+    """Speed-up to SHARE_PCT against a lone machine, paired by seed; NaN if never reached."""
     out = []
     for lone in (row for row in rows if row["arm"] == ALONE):
         for row in rows:
@@ -169,7 +169,7 @@ def speedup_rows(rows: Sequence[Row]) -> list[Row]:
 
 
 def round_rows(outcome: Outcome) -> list[Row]:
-    """After each of ROUNDS: means over the seeds, and with what was decided in the end; NaN where one drove fewer."""
+    """After each of ROUNDS: means over seeds, also with final decisions; NaN if a seed has fewer."""
     names = ("minutes", *FIGURES)
     nothing: Row = {**dict.fromkeys(names, math.nan), "decided": dict.fromkeys(names, math.nan)}
     out = []
@@ -184,7 +184,7 @@ def round_rows(outcome: Outcome) -> list[Row]:
 
 
 def repaved_rows(outcome: Outcome) -> list[Row]:
-    """Each ground that is repaved: medians over the seeds, NaN where one did not show it; shares pass by pass."""
+    """Per repaved ground: medians over seeds, NaN if a seed missed it; shares by pass."""
     out = []
     for parts in zip(*(each.repaved for each in outcome.scored), strict=True):
         names = ("passes", "least_passes", "minutes", "arrived_min")
@@ -196,7 +196,7 @@ def repaved_rows(outcome: Outcome) -> list[Row]:
 
 
 def spoiled_row(outcome: Outcome) -> Row:
-    """What the machine that is not as the others costs these: means over the seeds, 0 where the map is better."""
+    """Cost of the deviating machine to the others: means over seeds, 0 if the map improves."""
     parts = [each.spoiled for each in outcome.scored]
     by_seed = [{name: part[name] for name in ("cost_pct", "let_in_pct", "estimated_cost_pct")} for part in parts]
     excluded = {
@@ -208,7 +208,7 @@ def spoiled_row(outcome: Outcome) -> Row:
 
 
 def alarms(outcomes: Sequence[Outcome]) -> Row:
-    """Changes that were listed where there was none, of all live arms."""
+    """False changes of all live arms."""
     live_ones = [each for outcome in outcomes if not outcome.judging.central for each in outcome.scored]
     count, area = sum(each.alarms for each in live_ones), sum(each.km2_days for each in live_ones)
     return rounded({"count": count, "km2_days": area, "per_km2_day": count / area if area else None}, 8, per_km2_day=1)

@@ -1,7 +1,7 @@
-"""One arm, live: a router, a map server, and an agent per machine that replays its log, each a process of its own.
+"""One arm, live: router, map server, and an agent per machine replaying its log, a process each.
 
-Every agent has a link of its own, a proxy on loopback, which counts what it carries. Logs are replayed faster than they
-were recorded: outages and rates of links, and the seconds between two audits of the server, are shortened alike.
+Every agent's link is a counting proxy on loopback. Replays are faster than recorded; outages, link rates and the
+server's audit interval scale alike.
 """
 
 from __future__ import annotations
@@ -34,21 +34,18 @@ from sim.simulator import START_NS
 from sitegrid.process.children import Child, Children
 from tests.tcp_proxy import Proxy
 
-READY_S = 600.0  # a first start compiles kernels: minutes on a busy machine
-STEP_S = 0.05  # of a link's weather, and between two looks at it
-LATE_S = (
-    120.0  # beyond the length of a replay: a busy machine, and the time in which an agent waits for its last replies
-)
+READY_S = 600.0  # a first start compiles kernels: minutes on a busy host
+STEP_S = 0.05  # between updates of a link's quality
+LATE_S = 120.0  # beyond a replay's length: host load, and the agent's wait for last replies
 
 
 @dataclass(frozen=True)
 class LiveRun:
-    """What came of one arm.
+    """Result of one arm.
 
-    samples (n,): of the journal, in its order; machine (n,): index of each one's in `machines`; arrived_ns (n,): when
-    it was in the journal, in the log's time. events: of the journal, in plain values. sent_bytes, received_bytes: by
-    each machine's link. delivered: whether agents had all acknowledged in the end. late_s: by how much the replay took
-    longer than it should, in seconds of the log. pids: process ids, by name.
+    samples (n,): in journal order; machine (n,): index in `machines`; arrived_ns (n,): arrival in the journal, log
+    time. events: of the journal, plain values. sent_bytes, received_bytes: by link. delivered: everything acknowledged
+    at the end. late_s: excess time of the replay, log time. pids: by process name.
     """
 
     samples: Table
@@ -64,7 +61,7 @@ class LiveRun:
 
 
 def run(arm: Arm, drive: SharedDrive, cache: Path) -> LiveRun:
-    """Run an arm on a recording that is in the cache; SitegridError where a process fails."""
+    """Run an arm on a cached recording; SitegridError if a process fails."""
     with tempfile.TemporaryDirectory() as path, ExitStack() as opened:
         folder = Path(path)
         logs = dict(logs_of(arm, drive, cache, folder))
@@ -106,19 +103,19 @@ def run(arm: Arm, drive: SharedDrive, cache: Path) -> LiveRun:
 
 
 def logs_folder(cache: Path) -> Path:
-    """Where processes log, so that one that failed can be looked into."""
+    """Folder of process logs, for diagnosis."""
     folder = cache / "cooperation-logs"
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
 def _serve(processes: Children, folder: Path, logs: dict[str, Path], speed: float) -> tuple[int, dict[str, int]]:
-    """Start router and map server; returns the router's port, and process ids."""
+    """Start router and map server; returns the router's port and process ids."""
     endpoint = free_endpoint()
     site = open_log(next(iter(logs.values()))).site
     (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
     options = {"judge_s": TrustConfig().judge_s / speed}
-    lines = ["[store]", "archive_after_h = 0.0", "[trust]", *toml_lines(options)]  # stamps of logs are of another day
+    lines = ["[store]", "archive_after_h = 0.0", "[trust]", *toml_lines(options)]  # the logs' stamps are days old
     (folder / "server.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     router = processes.start("router", "router", "--listen", endpoint)
     router.expect("ready", READY_S)
@@ -134,7 +131,7 @@ def _agent(folder: Path, name: str, log: Path, link: Proxy, speed: float) -> Seq
 
 
 def _replayed(agent: Child, began_s: dict[str, float], took_s: float) -> dict[str, Any]:
-    """Wait for an agent's end; its last line, and `took_s`, from when it was ready. began_s: is told when that was."""
+    """Wait for an agent's end; returns its last line and `took_s` since ready. began_s: receives that time."""
     agent.expect("ready", READY_S)
     began_s[agent.name] = time.time()
     return {**agent.expect("ended", took_s + LATE_S)["ended"], "took_s": time.time() - began_s[agent.name]}
@@ -143,7 +140,7 @@ def _replayed(agent: Child, began_s: dict[str, float], took_s: float) -> dict[st
 def _keep_weather(
     link: Link, links: Mapping[str, Proxy], began_s: Mapping[str, float], speed: float, ending: threading.Event
 ) -> None:
-    """Have each link's weather follow its agent's time, from its start on."""
+    """Update each link's quality by its agent's time."""
     while not ending.wait(STEP_S):
         for turn, (name, proxy) in enumerate(links.items()):
             if name not in began_s:
@@ -154,12 +151,12 @@ def _keep_weather(
 
 
 def arrivals(rows: Sequence[JournalRow], began_s: Mapping[str, float], speed: float) -> Ints:
-    """When samples were in the journal (n,), in the time of their machines' logs, which began at these times."""
+    """Arrival of samples in the journal (n,), in log time; began_s: start of each log."""
     return _repeated([START_NS + round((row.received_ns - began_s[row.machine] * 1e9) * speed) for row in rows], rows)
 
 
 def _repeated(values: Sequence[int], rows: Sequence[JournalRow]) -> Ints:
-    """A value per row as one per sample."""
+    """One value per row to one per sample."""
     return np.repeat(np.array(values, np.int64), [len(row.rows) for row in rows])
 
 

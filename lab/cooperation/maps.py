@@ -1,7 +1,7 @@
-"""The map of one arm as it was at any time, made of its journal, or of what one process with a perfect link has.
+"""Maps of one arm at any time, from its journal or from one process with a perfect link.
 
-What the server decided about machines counts from when it decided it, so that a map of an early minute is what the
-server knew then. (Asked for the past, a map server corrects its samples by what it knows now; `decided` does that.)
+Decisions count from when they were made, so an early map shows what the server knew then. (A map server asked for the
+past corrects with today's knowledge; that is `decided`.)
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from protocol.site.geometry import CellWindow
 from sim.simulator import START_NS
 
 Layers = Mapping[str, Floats32]
-LAG_NS = round(LocalisationConfig().lag_s * 1e9)  # of the smoother: samples are final then, wherever it runs
+LAG_NS = round(LocalisationConfig().lag_s * 1e9)  # the smoother's: samples are final then
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Samples (n,) in the order in which they were there, time_ns (n,); machine (n,): each one's index in `machines`.
+    """Samples (n,) in order of time_ns (n,); machine (n,): index in `machines`.
 
-    facts: what was decided about machines, and from when on; the first from the beginning.
+    facts: decisions with their start, the first from the beginning.
     """
 
     samples: Table
@@ -54,34 +54,34 @@ class Timeline:
 
     @classmethod
     def of_run(cls, run: LiveRun, *, arrived: bool = False, decided: bool = False) -> Timeline:
-        """What an arm left. arrived: by arrival, not by stamps. decided: all decisions count from the begin."""
+        """From an arm's run. arrived: by arrival, not stamp. decided: all decisions count from the beginning."""
         stamps = run.samples["stamp_ns"].astype(np.int64)
         time_ns = run.arrived_ns if arrived else stamps
         order = np.argsort(time_ns, kind="stable")
         facts = facts_of(run.events)
         if decided:
             facts = ((0, facts[-1][1]),)
-        elif arrived:  # the site's now is the newest stamp that has arrived
+        elif arrived:  # the site's now is the newest arrived stamp
             now_ns, at_ns = np.maximum.accumulate(stamps[order]), time_ns[order]
             facts = tuple((_when(now_ns, at_ns, from_ns), each) for from_ns, each in facts)
         return cls(run.samples[order], run.machine[order], tuple(run.machines), time_ns[order], facts)
 
     def of_machines(self, names: Iterable[str]) -> Timeline:
-        """Of some machines' samples alone."""
+        """Samples of some machines only."""
         numbers = [self.machines.index(name) for name in names]
         chosen = np.isin(self.machine, numbers)
         return Timeline(self.samples[chosen], self.machine[chosen], self.machines, self.time_ns[chosen], self.facts)
 
     def by_machine(self, names: Iterable[str]) -> dict[str, Table]:
-        """The samples of each of some machines."""
+        """Samples by machine."""
         return {name: self.samples[self.machine == self.machines.index(name)] for name in names}
 
     def facts_at(self, time_ns: int) -> Facts:
-        """What was decided by then."""
+        """Decisions up to a time."""
         return [each for from_ns, each in self.facts if from_ns <= time_ns][-1]
 
     def maps(self, times_ns: Iterable[int], window: CellWindow) -> Iterator[Layers]:
-        """The map of each time, in ascending order: LAYERS (rows, columns)."""
+        """LAYERS (rows, columns) at each time, ascending."""
         config, facts, done = ServerConfig(), NO_FACTS, 0
         grid = Grid(CELL_M, FoldConfig())
         for time_ns in times_ns:
@@ -101,7 +101,7 @@ class Timeline:
 
 
 def facts_of(events: Iterable[Mapping[str, Any]]) -> tuple[tuple[int, Facts], ...]:
-    """What decisions in a journal came to, and from which site's now on [ns]; none before the first."""
+    """Facts from a journal's decisions, each with its site's now [ns]; none before the first."""
     decisions, out = Decisions(), [(0, NO_FACTS)]
     for event in events:
         decisions.hear([Event(event["id"], event["kind"], event["stamp_ns"], event["body"])], "the journal")
@@ -111,7 +111,7 @@ def facts_of(events: Iterable[Mapping[str, Any]]) -> tuple[tuple[int, Facts], ..
 
 
 def _when(now_ns: Ints, at_ns: Ints, from_ns: int) -> int:
-    """When the site's now, which is now_ns (n,) from at_ns (n,) on, was `from_ns`."""
+    """Time at which the site's now, now_ns (n,) from at_ns (n,), reached `from_ns`."""
     reached = int(np.searchsorted(now_ns, from_ns))
     return int(at_ns[reached]) if from_ns and reached < len(at_ns) else (0 if not from_ns else int(at_ns[-1]))
 
@@ -120,14 +120,14 @@ def _when(now_ns: Ints, at_ns: Ints, from_ns: int) -> int:
 
 
 def central_tasks(arm: Arm, seed: int) -> list[Task[Agent]]:
-    """The pipelines of an arm's machines, as agents have them by default."""
+    """Pipelines of an arm's machines with agents' defaults."""
     drive = arm.drive(seed)
-    order = sorted(drive.machines)  # as the log folders lie
+    order = sorted(drive.machines)  # order of log folders
     return [replay_task(Agent(order.index(name), closed_tours=True), drive) for name in arm.names(drive)]
 
 
 def central_timeline(arm: Arm, seed: int, cache: Path, *, arrived: bool) -> Timeline:
-    """What such a process has, by stamps or by when samples are final; it judges and calibrates once a minute."""
+    """Timeline of such a process, by stamp or finality; it judges and calibrates once a minute."""
     names = arm.names(arm.drive(seed))
     rows = {
         name: read_result(AgentSamples, drives.EXPERIMENT.file(task, cache)).samples
@@ -147,7 +147,7 @@ def central_timeline(arm: Arm, seed: int, cache: Path, *, arrived: bool) -> Time
 
 
 def decided(rows: Mapping[str, Table]) -> Facts:
-    """What the server's trust and calibration come to on samples."""
+    """The server's trust and calibration on samples."""
     if not rows:
         return NO_FACTS
     bad = accused(rows, calibrated(rows))

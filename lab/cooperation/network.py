@@ -1,4 +1,4 @@
-"""The road network that all arms are judged on: cells of the tours, what is true there, and figures of a map."""
+"""The road network that judges all arms: cells of the tours, their truth, figures of a map."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sitegrid.proof.figures import root_mean_square
 from sitegrid.proof.map_score import border_distance
 from sitegrid.proof.tracks import LoadTrack
 
-SURE = 0.6  # confidence from which a cell counts as known for certain
-SHARE_PCT = 90.0  # of the network's cells that are to be known, or of those that were repaved
-BORDER_M, BREAK_M = 2.0, 5.0  # from a border of soils, from a break of slope: nearer cells are judged apart
-STEP_M = 0.1  # between points of a line
-SLOPE_STEP = 0.01  # gradients that differ by less are one slope
+SURE = 0.6  # confidence from which a cell counts as certain
+SHARE_PCT = 90.0  # of the network, or of repaved cells
+BORDER_M, BREAK_M = 2.0, 5.0  # from soil borders and slope breaks; nearer cells are judged separately
+STEP_M = 0.1  # point spacing of lines
+SLOPE_STEP = 0.01  # gradients closer than this count as one slope
 LAYERS = ("resistance", "grade_east", "grade_north", "confidence", "resistance_class")
 FIGURES = (
     "covered_pct", "known_pct", "wrong_pct", "c_rr_pct", "c_rr_all_pct", "grade_pct", "grade_all_pct",
@@ -29,11 +29,11 @@ FIGURES = (
 
 @dataclass(frozen=True)
 class Network:
-    """Cells of the tours (k,), each once. row, column: in the true map. direction (k, 2): of travel, a unit vector.
+    """Unique cells of the tours (k,). row, column: in the true map. direction (k, 2): of travel, unit.
 
-    c_rr: true. border_m, break_m: distance from the nearest border of soils, from the nearest break of slope. profile
-    (k, 2): gradient of the ground without its unevenness; plane (k, 2): of the plane through the wheels of machines
-    that passed, NaN where none did. tour: index of the tour that it is of; of the first, where several share it.
+    c_rr: true. border_m, break_m: distance from the nearest soil border and slope break. profile (k, 2): gradient
+    without roughness. plane (k, 2): gradient of the plane through passing machines' wheels, NaN without one. tour:
+    index of the (first) tour.
     """
 
     row: Ints
@@ -52,12 +52,12 @@ class Network:
         return np.stack([self.column, self.row], axis=1).astype(np.float64) + 0.5
 
     def part(self, where: Bools) -> Network:
-        """Some of the cells."""
+        """A subset of the cells."""
         return replace(self, **{field.name: getattr(self, field.name)[where] for field in fields(self)})
 
 
 def network(ground: TrueGround, tracks: Iterable[LoadTrack]) -> Network:
-    """The cells that the lines of all tours pass. tracks: of machines that drove there; their planes are averaged."""
+    """Cells on the lines of all tours. tracks: of machines, for mean wheel planes."""
     cells: dict[tuple[int, int], tuple[Floats, int]] = {}
     for number, leg in enumerate(lines().values()):
         line = _dense(points(leg))
@@ -85,19 +85,19 @@ def network(ground: TrueGround, tracks: Iterable[LoadTrack]) -> Network:
 
 
 def break_distance(slope: Floats, cell_m: float) -> Floats:
-    """Distance [m] of cells (rows, columns) from the nearest of another slope; slope: gradients (rows, columns, 2)."""
+    """Distance [m] of cells from the nearest other slope; slope: gradients (rows, columns, 2)."""
     steps = np.round(slope / SLOPE_STEP).astype(np.int64)
     _, kinds = np.unique(steps.reshape(-1, 2), axis=0, return_inverse=True)
     return border_distance(kinds.reshape(steps.shape[:2]), cell_m)
 
 
 def figures(layers: Mapping[str, Floats32 | Floats], cells: Network) -> dict[str, float]:
-    """FIGURES of a map (rows, columns) over cells; NaN where nothing of it is known. Shares and gradients in percent.
+    """FIGURES of a map (rows, columns) over cells; NaN if unknown everywhere; percent.
 
-    covered_pct: right class, and SURE of it. wrong_pct: of known cells. c_rr_pct: root mean square of the relative
-    error more than BORDER_M from a border; c_rr_all_pct: of all cells. grade_pct: along the direction of travel,
-    against the plane through the wheels, more than BREAK_M from a break of slope; grade_all_pct: of all cells;
-    grade_across_pct: across that direction; grade_profile_pct: along it, against the ground without unevenness.
+    covered_pct: right class with confidence SURE. wrong_pct: of known cells. c_rr_pct: RMS relative error beyond
+    BORDER_M from a border; c_rr_all_pct: everywhere. grade_pct: along travel, against the wheel plane, beyond BREAK_M
+    from a slope break; grade_all_pct: everywhere; grade_across_pct: across travel; grade_profile_pct: along travel,
+    against the ground without roughness.
     """
     at = {name: np.asarray(layers[name], np.float64)[cells.row, cells.column] for name in LAYERS}
     kind, true = resistance_class(at["resistance"]), resistance_class(cells.c_rr)
@@ -127,14 +127,13 @@ def _rms(values: Floats) -> float:
 
 
 def _dense(line: Floats) -> Floats:
-    """A line (k, 2) with points STEP_M apart."""
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     at = np.arange(0.0, along[-1], STEP_M)
     return np.stack([np.interp(at, along, column) for column in line.T], axis=1)
 
 
 def _planes(tracks: Iterable[LoadTrack], shape: tuple[int, ...]) -> Floats:
-    """Mean gradient of the plane through the wheels in each cell (rows, columns, 2)."""
+    """Mean gradient of wheel planes by cell (rows, columns, 2)."""
     total, count = np.zeros((*shape, 2)), np.zeros(shape)
     for track in tracks:
         moved = np.diff(track.driven_m, prepend=0.0) > 0.01

@@ -1,4 +1,4 @@
-"""Ground that is repaved while machines drive: after how many passes a map shows it, and could show it at all."""
+"""Ground repaved during the drive: passes until a map shows it, and until it could."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from sim.simulator import START_NS
 from sitegrid.proof.figures import Row
 from sitegrid.proof.tracks import LoadTrack
 
-PASSES = 12  # that are looked at, at most
-REACH_M = 1.0  # from a load centre: cells further off were not driven, and no map could know what became of them
+PASSES = 12  # evaluated at most
+REACH_M = 1.0  # from a load centre: farther cells were not driven, so no map could know them
 
 
 def outlines(drive: SharedDrive) -> dict[str, tuple[Point, ...]]:
-    """Ground that is repaved, by its name."""
+    """Repaved outlines by name."""
     return {name: change.outline for name, change in drive.changes.items()}
 
 
 def inside(outline: Sequence[Point], place_m: Floats, margin_m: float = 0.0) -> Bools:
-    """Which places (n, 2) lie in an outline, or so near to it."""
+    """Whether places (n, 2) are inside an outline, or within margin_m."""
     corners = np.array(outline, np.float32)
     off_m = [cv2.pointPolygonTest(corners, (x, y), measureDist=True) for x, y in place_m.tolist()]
     return np.array(off_m) >= -margin_m
@@ -40,10 +40,10 @@ def inside(outline: Sequence[Point], place_m: Floats, margin_m: float = 0.0) -> 
 def repaved_rows(
     drive: SharedDrive, line: Timeline, arrivals: Timeline, true: Scene, names: Sequence[str]
 ) -> list[Row]:
-    """Of each ground that is repaved: after how many passes, and when, SHARE_PCT of its cells have the new class.
+    """Per repaved ground: passes and time until SHARE_PCT of its cells have the new class.
 
-    Cells of the network that lie 2 m inside. A pass begins after the change, and counts as it leaves the ground.
-    least_passes: when SHARE_PCT of the cells had been driven at all since the change.
+    Network cells at least 2 m inside. A pass starts after the change and counts on leaving the ground. least_passes:
+    until SHARE_PCT of the cells were driven at all.
     """
     tracks = [true.tracks[name] for name in names]
     before = network(true_ground(drive.ground, drive.seed), ())
@@ -80,14 +80,14 @@ def _first(shares_pct: Sequence[float]) -> int | None:
 
 
 def driven_pct(tracks: Iterable[LoadTrack], place_m: Floats, from_ns: int, to_ns: int) -> float:
-    """Share of places (n, 2) that load centres came within REACH_M of between two stamps."""
+    """Share of places (n, 2) within REACH_M of load centres between two stamps."""
     whole = np.concatenate([track.place_m[(track.stamp_ns > from_ns) & (track.stamp_ns <= to_ns)] for track in tracks])
     off_m, _ = cKDTree(whole[np.isfinite(whole[:, 0])]).query(place_m)
     return 100.0 * float((off_m <= REACH_M).mean())
 
 
 def passes(track: LoadTrack, there: Bools, from_ns: int) -> Ints:
-    """Stamps (k,) at which a machine left a ground that it had come to after a time; there (n,): when it was on it."""
+    """Stamps (k,) of leaving a ground entered after from_ns; there (n,): presence on it."""
     begins = np.flatnonzero(np.diff(there.astype(np.int8), prepend=0) > 0)
     ends = np.flatnonzero(np.diff(there.astype(np.int8), append=0) < 0)
     whole = (track.stamp_ns[begins] > from_ns) & (ends < len(there) - 1)

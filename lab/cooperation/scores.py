@@ -1,4 +1,4 @@
-"""Figures of one arm with one seed: its map over time and after rounds, of repaved ground, with one machine spoiled."""
+"""Figures of one arm and seed: map over time and by round, repaved ground, a spoiled machine."""
 
 from __future__ import annotations
 
@@ -30,35 +30,34 @@ from sim.simulator import START_NS
 from sitegrid.proof.figures import Row
 from sitegrid.proof.map_score import DrivenScore, score_driven
 
-STEP_S = 15.0  # between two maps over time
-AFTER_S = 30.0  # of a recording's end, when all its samples become final and are sent
-ROUNDS = (1, 2, 3, 4, 5, 6)  # of its tours, that every machine has driven
-NEAR_M = 6.0  # of repaved ground: a change that is listed there is no false alarm
+STEP_S = 15.0  # between maps over time
+AFTER_S = 30.0  # after a recording's end: all its samples are final and sent
+ROUNDS = (1, 2, 3, 4, 5, 6)  # of tours, driven by every machine
+NEAR_M = 6.0  # of repaved ground: changes listed within it are true
 CENTRAL = "central"
 
 
 @dataclass(frozen=True)
 class Judging:
-    """An arm to be judged, as it ran, or as one process with a perfect link has it."""
+    """An arm to judge: as it ran, or as one process with a perfect link."""
 
     arm: Arm
     central: bool = False
 
     @property
     def name(self) -> str:
-        """Short and unique."""
+        """Short unique name."""
         return CENTRAL if self.central else self.arm.name
 
 
 @dataclass(frozen=True)
 class Scored:
-    """Figures of one arm with one seed.
+    """Figures of one arm and seed.
 
-    minutes (t,): of the maps over time; by_stamp, by_arrival (t, FIGURES): of them. rounds: rows, one per round that
-    all machines drove; `decided`: with what was decided about machines in the end. end: of the last map. repaved: a row
-    per ground. spoiled: what the last machine costs the others. alarms: how often a change was listed where there was
-    none, in so many km2 days. same_pct: of one process with a perfect link, its samples that the live agents sent too,
-    bit for bit.
+    minutes (t,): times of the maps; by_stamp, by_arrival (t, FIGURES). rounds: a row per round that all machines drove;
+    `decided`: with the final decisions. end: of the last map. repaved: a row per ground. spoiled: cost of the last
+    machine to the others. alarms: false changes in km2_days. same_pct: central samples that live agents sent too, bit
+    for bit.
     """
 
     minutes: Floats
@@ -74,7 +73,7 @@ class Scored:
 
 
 def minutes_until(minutes: Floats, values: Floats, limit: float) -> float:
-    """When a figure (t,) was at a limit first, between two maps in proportion; NaN for never."""
+    """First time at which a figure (t,) reached a limit, interpolated; NaN: never."""
     reached = np.flatnonzero(values >= limit)
     if not len(reached):
         return float("nan")
@@ -134,7 +133,7 @@ def _solve(task: Task[Judging], cache: Path) -> Scored:
 
 
 def same_pct(central: Timeline, run: LiveRun) -> float:
-    """Share of the samples of one process that the live agents' samples are, bit for bit."""
+    """Share of central samples that the live agents also sent, bit for bit."""
     own, theirs = ({row.tobytes() for row in table} for table in (central.samples, run.samples))
     return 100.0 * len(own & theirs) / max(1, len(own))
 
@@ -144,7 +143,7 @@ def _live(arm: Arm, drive: SharedDrive, cache: Path) -> LiveRun:
 
 
 def rounds_ns(true: Scene, drive: SharedDrive, names: Sequence[str], rounds: int) -> int | None:
-    """When all of these machines had driven so many rounds of their tours; None where one did not."""
+    """Time at which all machines had driven `rounds` of their tours; None if one did not."""
     stamps = []
     for name in names:
         track = true.tracks[name]
@@ -155,20 +154,20 @@ def rounds_ns(true: Scene, drive: SharedDrive, names: Sequence[str], rounds: int
 
 
 def driven_figures(layers: Layers, true: Scene, names: Sequence[str]) -> Row:
-    """J of the cells that these machines' load centres truly passed, and how many of them are known."""
+    """J over the truly driven cells, and the share known."""
     score = driven_score(layers, true, names)
     figures_of = (score.wrong_resistance_pct, score.wrong_grade_pct, score.known_pct)
     return dict(zip(("driven_wrong_pct", "driven_slope_wrong_pct", "driven_known_pct"), figures_of, strict=True))
 
 
 def places_c_rr_pct(line: Timeline, true: Scene, names: Sequence[str], cells: Network) -> float:
-    """`c_rr_pct` of a map of the same samples with true values: what comes of their places alone."""
+    """`c_rr_pct` of a map with true values at the samples' places: the effect of position alone."""
     exact = {name: with_true_values(rows, true, name) for name, rows in line.by_machine(names).items()}
     return figures(folded(exact.items(), window_of(true.truth), LAYERS), cells)["c_rr_pct"]
 
 
 def driven_score(layers: Mapping[str, AnyArray], true: Scene, names: Sequence[str]) -> DrivenScore:
-    """A map against the truth, where these machines truly passed."""
+    """A map against the truth on truly driven cells."""
     tracks = [true.tracks[name].place_m for name in names]
     return score_driven(region_of(true.truth, layers), true_layers(true.truth), tracks)
 
@@ -177,7 +176,7 @@ def driven_score(layers: Mapping[str, AnyArray], true: Scene, names: Sequence[st
 
 
 def false_alarms(run: LiveRun, drive: SharedDrive, last: Layers, seconds: float) -> tuple[int, float]:
-    """Changes that the server lists where the ground did not change, and the known area times the time [km2 days]."""
+    """Listed changes off repaved ground, and known area times time [km2 days]."""
     newest = {event["body"]["id"]: event["body"] for event in run.events if event["kind"] == CHANGE}
     centres = [((b[0] + b[2]) / 2, (b[1] + b[3]) / 2) for b in (body["bounds"] for body in newest.values())]
     true = [any(inside(each, np.array([at]), NEAR_M)[0] for each in outlines(drive).values()) for at in centres]
@@ -189,16 +188,16 @@ def false_alarms(run: LiveRun, drive: SharedDrive, last: Layers, seconds: float)
 
 
 def spoiled_costs(run: LiveRun, line: Timeline, last: Layers, true: Scene, names: Sequence[str], arm: Arm) -> Row:
-    """What the last machine costs the map of the others, in points of wrong cells where these drove.
+    """Cost of the last machine to the others' map, in points of wrong cells where they drove.
 
-    cost_pct: with true values, in the map as the server has it in the end; let_in_pct: had it not been excluded.
-    estimated_cost_pct: with estimated values. excluded_min: when it was excluded.
+    cost_pct: true values, server's final decisions; let_in_pct: without exclusion. estimated_cost_pct: estimated
+    values. excluded_min: time of exclusion.
     """
     *good, bad = names
     rows = line.by_machine(names)
     exact = {name: with_true_values(table, true, name) for name, table in rows.items()}
     if arm.spoiled == BAD:
-        exact[bad]["applied_zero"] = exact[bad]["applied_scale"] = 0.0  # nothing was taken off true values
+        exact[bad]["applied_zero"] = exact[bad]["applied_scale"] = 0.0  # true values were not corrected
         exact |= gain({name: exact[name] for name in (good[0], bad)}, true, GAIN).rows
     window = window_of(true.truth)
 

@@ -1,4 +1,4 @@
-"""The command line of the loads."""
+"""Command line of the loads."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sitegrid.proof.figures import Row
 
 
 class Load(Protocol):
-    """A module of this folder. OPTIONS: of `run`, with their defaults; GOALS: by case and figure."""
+    """A module of this folder. OPTIONS: of `run`, with defaults. GOALS: by case and figure."""
 
     OPTIONS: Mapping[str, float]
     GOALS: Goals
@@ -61,7 +61,7 @@ LOADS = {
 
 
 def load_of(name: str) -> Load:
-    """The module of a load; only that one is imported, since a process that is measured has its parent's imports."""
+    """Import this load only: a measured process inherits its parent's imports."""
     return cast("Load", import_module(f"lab.speed.{name}"))
 
 
@@ -77,7 +77,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _parser(words: Sequence[str] | None) -> argparse.ArgumentParser:
-    """A sub-command for each load, so that an option that does nothing for it is refused."""
+    """A sub-command per load, so that inapplicable options are refused."""
     parser = argparse.ArgumentParser(prog="python -m lab speed", description="Measure how fast the parts are.")
     loads = parser.add_subparsers(required=True, metavar="LOAD", dest="load", help="what to measure:")
     for name, what in LOADS.items():

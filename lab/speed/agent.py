@@ -1,6 +1,6 @@
-"""A whole agent, fed as a machine feeds it: `python -m lab.speed.agent SECONDS` prints its share of a core and memory.
+"""A whole agent on synthetic readings: `python -m lab.speed.agent SECONDS` prints its share of a core and memory.
 
-It imports an agent alone.
+Imports an agent only.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tests.memory import memory_mb
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 LEVERS_M = {"gps-1": (0.8, 0.5, 3.0), "gps-2": (0.8, -0.5, 3.0)}
 START_NS, STEP_NS = 1_767_225_600_000_000_000, 10_000_000
-WHEELS_EVERY, FIX_EVERY = 2, 20  # steps of 10 ms: IMU at 100 Hz, encoder at 50 Hz, each receiver at 5 Hz
+WHEELS_EVERY, FIX_EVERY = 2, 20  # steps of 10 ms: IMU 100 Hz, encoder 50 Hz, receivers 5 Hz
 SPEED_MPS, ACCEL_MPS2, RADIUS_M = 3.0, 0.5, 15.0
 FIX_M2, FIX_M = 1.0, 0.3
 
@@ -36,7 +36,7 @@ def machine() -> MachineConfig:
 
 
 def progress(seconds: float) -> tuple[float, float, float]:
-    """Distance [m], speed [m/s] and acceleration [m/s2] of a machine that sets off."""
+    """Distance [m], speed [m/s], acceleration [m/s2] of a starting machine."""
     ramp_s = SPEED_MPS / ACCEL_MPS2
     if seconds < ramp_s:
         return ACCEL_MPS2 * seconds**2 / 2, ACCEL_MPS2 * seconds, ACCEL_MPS2
@@ -50,7 +50,7 @@ def place(distance_m: float) -> tuple[float, float, float]:
 
 
 def bundles(seconds: int) -> Iterator[list[Reading]]:
-    """Readings of a drive, a second at a time; fixes waver by FIX_M."""
+    """Readings of a drive by second; fixes oscillate by FIX_M."""
     driven, projection = machine(), Projection(SITE)
     ticks_per_m = driven.sensors[1].ticks_per_rev / (2 * math.pi * driven.wheel_radius_m)
     for first in range(0, 100 * seconds, 100):
@@ -74,7 +74,7 @@ def _fix(name: str, stamp_ns: int, at: tuple[float, float, float], projection: P
 
 
 def main() -> None:
-    """Print the CPU time per simulated second, and the most memory that was resident."""
+    """Print CPU time per simulated second, and peak resident memory."""
     pipeline = Pipeline(SITE, machine(), PipelineConfig())
     seconds, cpu_s = int(sys.argv[1]), 0.0
     for readings in bundles(seconds):

@@ -1,7 +1,7 @@
-"""How long `sitegrid fold` takes for an archive: one thread, two threads, workers of Dask.
+"""Duration of `sitegrid fold` on an archive: one thread, two threads, Dask workers.
 
-Each variant is the whole command, in turn, started by `python -m lab.speed.archive VARIANT ARCHIVE STORE`; the
-archive was just written, so that its files are in the system's cache. Hashes of the snapshots are compared.
+Each variant is the whole command, in turn: `python -m lab.speed.archive VARIANT ARCHIVE STORE`. The archive is fresh,
+thus in the file cache. Snapshot hashes are compared.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ VARIANTS = ("thread", "threads", "jobs")
 
 
 def run(samples: int, runs: int) -> Iterator[Row]:
-    """An archive of so many samples, in hourly files of ten machines' work, folded by every variant in turn.
+    """An archive in hourly files of ten machines' work, folded by every variant in turn.
 
-    One thread, two threads of one process, two workers of Dask on this host. wall_s, cpu_s of all processes,
-    times_one_thread: how many times as fast. RuntimeError where the maps differ.
+    One thread, two threads, two local Dask workers. wall_s; cpu_s: of all processes; times_one_thread: speed-up.
+    RuntimeError if maps differ.
     """
     with tempfile.TemporaryDirectory() as path:
         folder, hashes = Path(path), set[str]()
@@ -61,7 +61,7 @@ def run(samples: int, runs: int) -> Iterator[Row]:
 
 
 def _write(folder: Path, samples: int) -> None:
-    """Write an archive: hours of reception, each when its last sample was stamped."""
+    """Write an archive by hours of reception, each row received at its last stamp."""
     hour: list[tuple[JournalRow, int]] = []
     for row in _rows(samples):
         if hour and row.received_ns // HOUR_NS != hour[0][1] // HOUR_NS:
@@ -79,9 +79,9 @@ def _rows(samples: int) -> Iterator[JournalRow]:
 
 
 def fold_timed(variant: str, archive: Path, out: Path) -> dict[str, Any]:
-    """Fold as one variant does it."""
+    """Fold with one variant."""
     if variant == "thread":
-        os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])  # which a fold respects
+        os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])  # fold respects it
     words = ["--jobs", str(WORKERS)] if variant == "jobs" else []
     command = [sys.executable, "-m", "sitegrid.cli", "fold", str(archive), "--out", str(out), "--json", *words]
     start_s = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What it takes to write the map of 1 km2 as a GeoTIFF: by the command, of a store; and its memory."""
+"""Time and memory to write 1 km2 of map as a GeoTIFF: by command, from a store."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ MB = 1e6
 
 
 def run(hours: float, runs: int) -> Iterator[Row]:
-    """command: of a store of so many hours of work, from its start. map: once its layers are asked for.
+    """command: on a store of `hours` of work, start included. map: after its layers are read.
 
-    times_layers: the most memory that it takes on top, the layers with it, to that of the layers.
+    times_layers: extra peak memory, layers included, over the layers' size.
     """
     with tempfile.TemporaryDirectory() as path:
         store, site = Path(path) / "store", Path(path) / "site.toml"
@@ -57,7 +57,7 @@ def run(hours: float, runs: int) -> Iterator[Row]:
 
 
 def _spent(command: list[str]) -> Figures:
-    """Seconds that a command took, with the processor time of its own process."""
+    """Wall time of a command, and its CPU time."""
     before = os.times()
     took = timed(lambda: subprocess.run(command, check=True, capture_output=True))  # noqa: S603
     after = os.times()
@@ -66,7 +66,7 @@ def _spent(command: list[str]) -> Figures:
 
 
 def of_map(folder: Path) -> Figures:
-    """What writing takes beyond asking, with all libraries loaded."""
+    """Cost of writing beyond reading, libraries loaded."""
     return_large_blocks()
     keys = {"asked_as_of": None, "asked_machine": None, "asked_resolution": None, "asked_layers": LAYERS}
     place = {"store": folder / "store", "site_file": folder / "site.toml", "config": None}
@@ -75,7 +75,7 @@ def of_map(folder: Path) -> Figures:
         region = wanted.region()
         copied = replace(wanted, map=OpenMap(lambda _: replace(region, layers=_copies(region))))
         corner = replace(wanted, cells=replace(wanted.cells, area=Bounds(0.0, 0.0, 300.0, 300.0)))
-        write_tif(io.BytesIO(), corner, ())  # which loads the libraries
+        write_tif(io.BytesIO(), corner, ())  # loads the libraries
         release_memory()
         rest_mb = forget_peak_mb(os.getpid())
         with whole_file(folder / "map.tif") as file:

@@ -1,8 +1,7 @@
-"""Microseconds per step of the filters, own and filterpy's stock one; what the smoother and a whole agent cost.
+"""Microseconds per filter step, ours and stock filterpy; cost of the smoother and a whole agent.
 
-Stock comes twice: plain, which is wrong where angles cross +-pi, and with the functions for angles that it asks for.
-The agent's pure core is fed as a machine feeds it, in a process of its own that imports an agent alone:
-`python -m lab.speed.agent SECONDS`.
+Stock runs twice: plain, wrong where angles wrap at +-pi, and with its optional angle functions. The agent's pure core
+runs in a process of its own that imports an agent only: `python -m lab.speed.agent SECONDS`.
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ from sitegrid.proof.figures import Row
 
 OPTIONS = {"runs": 5, "steps": 1000}
 GOALS: dict[tuple[str, str], str] = {}
-LAYOUT = Layout()  # the 15 states
+LAYOUT = Layout()  # 15 states
 MODEL = MotionModel(LAYOUT)
 DT_S = 0.01
-SMOOTHER_S, AGENT_S = 150, 60  # of drives; the smoother's window is full for the last minute
+SMOOTHER_S, AGENT_S = 150, 60  # drive lengths; the smoother's window is full for the last minute
 LAGS_S = (0.0, 90.0)
 MEASURED = {"update position": slice(POSITION.start, POSITION.start + 2), "update rate": RATE}
 STOCK, ANGULAR = "stock ukf", "stock ukf, angles"
@@ -42,14 +41,14 @@ FilterStep = Callable[[], object]
 
 
 def run(steps: int, runs: int) -> Iterator[Row]:
-    """Each step of each filter, so many times a run; the smoother and a whole agent in percent of a core.
+    """Every step of every filter, `steps` times per run; smoother and agent in percent of a core.
 
-    times_stock, times_stock_angles: how many times as fast as filterpy's filter.
+    times_stock, times_stock_angles: speed-up over filterpy.
     """
     filters = {STOCK: _stock({}), ANGULAR: _stock(ANGLE_SAFE), "ukf": _own(Ukf()), "ekf": _own(Ekf())}
     works = {f"{name}, {step}": work for name, made in filters.items() for step, work in made.items()}
     for work in works.values():
-        work()  # what is made once is made
+        work()  # one-time set-up
     took = in_turn({name: partial(_repeated, work, steps) for name, work in works.items()}, runs)
     for name, figures in took.items():
         step = name.rpartition(", ")[2]
@@ -75,7 +74,7 @@ def _repeated(work: FilterStep, steps: int) -> Figures:
 
 
 def _smoothed(fed: Sequence[Sequence[Reading]], name: str, lag_s: float) -> Figures:
-    """A whole drive with a filter and a smoother's lag."""
+    """A whole drive with a filter and smoother lag."""
     config = PipelineConfig(localisation=LocalisationConfig(filter=name, lag_s=lag_s))
     positioning = Positioning(agent.SITE, agent.machine(), config)
 
@@ -87,16 +86,16 @@ def _smoothed(fed: Sequence[Sequence[Reading]], name: str, lag_s: float) -> Figu
 
 
 def _start() -> Belief:
-    """A machine at 3 m/s on a bumpy road, known as well as one that is well measured."""
+    """Well-measured machine at 3 m/s on a bumpy road."""
     x = np.zeros(LAYOUT.n)
     x[ATTITUDE], x[VELOCITY], x[RATE] = (0.05, -0.1, 0.7), (3.0, 0.1, 0.0), (0.02, 0.01, 0.3)
-    return definite(0, x, np.diag(np.linspace(0.02, 0.5, LAYOUT.n)))  # with its factor, as a filter leaves it
+    return definite(0, x, np.diag(np.linspace(0.02, 0.5, LAYOUT.n)))  # with its factor, like a filter's result
 
 
 def _own(kind: Filter) -> dict[str, FilterStep]:
-    """What an agent does for each step, the making of the motion and of the measurement included.
+    """An agent's work per step, including motion and measurement.
 
-    As in a drive a step finds the factor of its belief's covariance, and computes that of the belief it makes.
+    As in a drive, a step finds its belief's covariance factor and computes the next one's.
     """
     belief = _start()
     updates = {name: _conditioned(kind, belief, states) for name, states in MEASURED.items()}
@@ -115,13 +114,13 @@ def _conditioned(kind: Filter, belief: Belief, states: slice) -> FilterStep:
 
 
 def _stock(options: dict[str, Any]) -> dict[str, FilterStep]:
-    """The filter as its documentation shows it: functions of one state, in Python."""
+    """Filterpy as documented: Python functions of one state."""
     points = MerweScaledSigmaPoints(LAYOUT.n, alpha=0.5, beta=2.0, kappa=0.0)
     start = _start()
     ukf = UnscentedKalmanFilter(LAYOUT.n, 2, DT_S, hx=None, fx=_stock_motion, points=points, **options)
     ukf.Q = motion(MODEL, start, DT_S).Q
     ukf.x, ukf.P = start.x, start.P
-    ukf.predict()  # draws the sigma points that each update uses
+    ukf.predict()  # draws the sigma points for updates
 
     def predict() -> None:
         ukf.x, ukf.P = start.x, start.P
@@ -142,25 +141,24 @@ def _stock(options: dict[str, Any]) -> dict[str, FilterStep]:
 
 
 def _stock_residual(a: Floats, b: Floats) -> Floats:
-    """Difference of two states."""
     y: Floats = a - b
     y[ATTITUDE] = (y[ATTITUDE] + math.pi) % (2 * math.pi) - math.pi
     return y
 
 
 def _stock_mean(sigmas: Floats, weights: Floats) -> Floats:
-    """Mean of states, of angles by their sines and cosines."""
+    """Mean of states; angles by sine and cosine."""
     x: Floats = weights @ sigmas
     x[ATTITUDE] = np.arctan2(weights @ np.sin(sigmas[:, ATTITUDE]), weights @ np.cos(sigmas[:, ATTITUDE]))
     return x
 
 
-# What filterpy needs to be right across +-pi, as its author's book has it; own filters do the same.
+# Functions that filterpy needs across +-pi, by its author's book; our filters do the same.
 ANGLE_SAFE = {"residual_x": _stock_residual, "x_mean_fn": _stock_mean}
 
 
 def _stock_motion(x: Floats, dt: float) -> Floats:
-    """The same motion, of one state; plain numbers are faster than arrays of three."""
+    """The same motion for one state; scalars are faster than arrays of three."""
     px, py, pz, roll, pitch, yaw, vx, vy, vz, p, q, r, ax, ay, az = x.tolist()
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
     forward, left, up = (v * dt + a * dt * dt / 2 for v, a in ((vx, ax), (vy, ay), (vz, az)))

@@ -1,7 +1,7 @@
-"""A whole fleet at one map server: how fast batches are acknowledged, what that costs, and how many it takes.
+"""A whole fleet at one map server: acknowledgement times, cost, capacity.
 
-Also the link of one agent at work, in real time: its bytes by TCP with Zenoh's framing, acknowledgements and signs of
-life; TLS and the headers of TCP and IP come on top.
+Also one agent's link in real time: TCP bytes with Zenoh's framing, acknowledgements and keep-alives; TLS and TCP/IP
+headers come on top.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tests.site_work import BATCH, HOURS, START_NS, samples_of, write_store
 from tests.tcp_proxy import Proxy
 
 OPTIONS = {"machines": 500, "seconds": 70.0, "hours": HOURS}
-LOADS = {"paced": 1.0, "saturated": 0.0}  # seconds from batch to batch of a machine
+LOADS = {"paced": 1.0, "saturated": 0.0}  # seconds between batches of a machine
 GOALS = {
     ("paced", "refused"): "<= 0",
     ("paced", "ack_ms_p99"): "<= 150",
@@ -34,16 +34,16 @@ GOALS = {
     ("saturated", "samples_per_s"): ">= 25000",
 }
 SITE_FILE = ROOT / "config" / "site.toml"
-LAG_S = 100.0  # from a place on the road to its sample, which ends the time before the usual traffic
-SPEED = 1.0  # of the agent's drive: health and acknowledgements are by the clock
+LAG_S = 100.0  # from a place to its sample, before regular traffic
+SPEED = 1.0  # of the agent's drive: health and acknowledgements follow the clock
 
 
 def run(machines: int, seconds: float, hours: float) -> Iterator[Row]:
-    """Machines that send to a server with a store of so many hours of work, paced, then as fast as they are served.
+    """A fleet against a server with `hours` of work, paced, then saturated.
 
-    Figures: samples a second that were acknowledged, refused batches, milliseconds until an acknowledgement, cores and
-    the most memory of server and router, what the server writes. Agent: bytes a second of its link and samples a
-    second, for as long; bytes of a sample in an archive, whose files are compressed: made-up samples would take fewer.
+    Acknowledged samples per second, refused batches, milliseconds to acknowledgement, cores and peak memory of server
+    and router, server's disk writes. Agent: link bytes and samples per second; compressed archive bytes per sample,
+    from a real drive because synthetic samples compress better.
     """
     with tempfile.TemporaryDirectory() as path, Site(Path(path)) as site, ExitStack() as opened:
         write_store(Path(path), SITE, samples_of(hours) // BATCH, tail_rows=0)
@@ -72,13 +72,13 @@ def _measured(server: int, router: int, senders: list[Machine], seconds: float, 
 
 
 def _written_bytes(process: int) -> int:
-    """What a process has had written to disks."""
+    """Bytes a process wrote to disk."""
     lines = Path(f"/proc/{process}/io").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("write_bytes"))
 
 
 def _agent_link(folder: Path, seconds: float) -> Figures:
-    """An agent that replays a simulated drive. Somebody listens to its pose and health: else they are never sent."""
+    """An agent replaying a simulated drive, with subscribers to pose and health, which are else not sent."""
     log, store, config = folder / "log", folder / "store", load_site(SITE_FILE)
     store.mkdir()
     words = ("--record", log, "--machines", 1, "--seconds", SPEED * seconds + 1.5 * LAG_S, "--speed", 0)
@@ -106,7 +106,7 @@ def _acknowledged(store: Path) -> int:
 
 
 def _archived(store: Path) -> float:
-    """Bytes of a sample in an archive of all of a journal as one file."""
+    """Bytes per sample of a journal archived as one file."""
     location = JournalLocation(store)
     with location.reader() as journal:
         rows = ((row, START_NS) for row in journal.read())

@@ -1,8 +1,7 @@
-"""Followers beside a map server: how soon they show what it has acknowledged, and what readers cost the machines.
+"""Followers beside a map server: their lag, and the readers' cost to machines.
 
-Router, server, followers and readers are processes of their own, on this host, the machines send from here. Readers are
-this module, `python -m lab.speed.followers ENDPOINT SECONDS [FOLLOWER...]`. Each asks one follower, as clients do, or
-the server where there is none.
+Router, server, followers and readers are local processes; machines send from here. Readers: `python -m
+lab.speed.followers ENDPOINT SECONDS [FOLLOWER...]`; each queries one follower, like clients, or else the server.
 """
 
 from __future__ import annotations
@@ -55,22 +54,22 @@ GOALS = {
     (FOLLOWED, "equal"): ">= 1",
 }
 READERS = 50
-EVERY_S = 1.0  # a reader asks for a point and a region so often, as a page that shows the surroundings of a machine
+EVERY_S = 1.0  # reader interval for a point and a region, like a page around a machine
 LAYERS = ("resistance", "grade", "visits")
 HALF_M = 32.0
 PROBE_S, RETRY_S, END_S = 0.1, 0.5, 60.0
-QUIET = "[trust]\nexclude = false\n[calibration]\nautomatic = false\n"  # these machines drive past each other at random
+QUIET = "[trust]\nexclude = false\n[calibration]\nautomatic = false\n"  # these machines' tracks cross at random
 FOLLOWERS = ("reader-1", "reader-2")
 WHOLE = "bounds=-128,-128,128,128;layers=resistance,visits,age_s"
-LOADS = {"paced": 1.0, "saturated": 0.0}  # seconds from batch to batch of a machine
+LOADS = {"paced": 1.0, "saturated": 0.0}  # seconds between batches of a machine
 
 
 def run(machines: int, seconds: float, hours: float, runs: int) -> Iterator[Row]:
-    """Machines that send for so many seconds paced, then as fast as they are served; variants in turn.
+    """Machines send paced, then saturated; variants in turn.
 
-    paced_, saturated_: samples a second that were acknowledged, milliseconds until then, cores of the server and of the
-    followers, the share of samples that is lost against `alone`. visible_ms: from an acknowledgement until a follower
-    has answered with its row in the map. equal: 1 where server and followers give the same bytes in the end.
+    paced_, saturated_: acknowledged samples per second, milliseconds to acknowledgement, cores of server and followers,
+    throughput lost against `alone`. visible_ms: from acknowledgement until a follower answers with that row. equal: 1
+    if server and followers finally answer with equal bytes.
     """
     with tempfile.TemporaryDirectory() as path, ExitStack() as opened:
         site = opened.enter_context(Site(Path(path), options=STORE_OPTIONS + QUIET))
@@ -118,7 +117,7 @@ def _loaded(
 
 
 def _probe(endpoint: str, visible_ms: list[float], ended: threading.Event) -> None:
-    """Samples of one more machine, and how long after each acknowledgement a follower has it [ms]."""
+    """Probe machine: time from acknowledgement to visibility at a follower [ms]."""
     legs, sent, name = samples(99_999), 0, f"probe-{time.time_ns() % 10**9}"
     with session(endpoint) as link:
         while not ended.is_set():
@@ -132,7 +131,7 @@ def _probe(endpoint: str, visible_ms: list[float], ended: threading.Event) -> No
 
 
 def _equal(endpoint: str) -> bool:
-    """Whether server and followers give the same bytes for one version of the map."""
+    """Whether server and followers answer one map version with equal bytes."""
     with session(endpoint) as link:
         (whole,) = ask(link, f"{keys.map_query(SITE.name, 'region')}?{WHOLE}")
         row = decode_region(whole).merged
@@ -141,7 +140,7 @@ def _equal(endpoint: str) -> bool:
 
 
 def read(endpoint: str, seconds: float, followers: Sequence[str]) -> Figures:
-    """Readers that ask for so long, each over a session of its own; how many answers, how soon, from whom."""
+    """Readers with a session each; number, latency and origin of answers."""
     ms: list[float] = []
     origins: Counter[str] = Counter()
     with ExitStack() as opened:
@@ -174,7 +173,7 @@ def read(endpoint: str, seconds: float, followers: Sequence[str]) -> Figures:
 
 
 def _origin(link: zenoh.Session, selector: str) -> str:
-    """Ask until there is an answer; the follower that gave it, empty for the server."""
+    """Query until answered; returns the follower, empty for the server."""
     while True:
         for reply in link.get(selector, timeout=ANSWER_S):
             if reply.ok is not None and reply.ok.attachment is not None:

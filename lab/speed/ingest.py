@@ -1,6 +1,6 @@
-"""Samples from a machine's bytes to the grid (decode, check, commit to disk, fold), and their bytes in the journal.
+"""Samples from wire bytes to grid (decode, check, commit to disk, fold), and their bytes in the journal.
 
-On SQLite and, where its server is installed, on PostgreSQL, alone and with a synchronous replica on the same disk.
+On SQLite and, if installed, PostgreSQL, alone and with a synchronous replica on the same disk.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ GOALS = {
     (f"{POSTGRES}, 100 in a batch, 16 in a commit", "of_sqlite"): ">= 0.5",
     (f"{REPLICATED}, 100 in a batch, 16 in a commit", "of_sqlite"): ">= 0.4",
 }
-BATCHES = (6, 100, 1000)  # samples: a second of a machine with a good link, half a minute of it, a backlog
-GROUPS = (1, 16)  # batches in one commit: a single machine waiting for its answer, and many at once
-SMALLEST, GROUP = 3, 10  # samples in a batch of a machine at 3 m/s, batches in a commit: bytes in the journal
+BATCHES = (6, 100, 1000)  # samples: a second of a machine on a good link, half a minute, a backlog
+GROUPS = (1, 16)  # batches per commit: one waiting machine, many at once
+SMALLEST, GROUP = 3, 10  # samples per batch at 3 m/s, batches per commit: bytes in the journal
 TABLES = "SELECT sum(pg_total_relation_size(oid)) FROM pg_class WHERE relkind = 'r' AND relnamespace = "
 
 
 def run(samples: int, runs: int) -> Iterator[Row]:
-    """Every journal with every size of batch and group, each run on a new store, in turn; figures None without one.
+    """Every journal with every batch and group size, on new stores in turn; None if not installed.
 
-    of_sqlite: samples a second as a share of SQLite's. journal_b_per_sample: in batches of 3; of a database with
-    its indices, after a vacuum.
+    of_sqlite: throughput relative to SQLite. journal_b_per_sample: batches of 3; databases with indices, after a
+    vacuum.
     """
     rows = track(samples)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
@@ -74,7 +74,7 @@ def run(samples: int, runs: int) -> Iterator[Row]:
 
 
 def _journals(opened: ExitStack) -> dict[str, Callable[[], str]]:
-    """What makes the URL of a new journal, by the name of what keeps it."""
+    """Factories of new journal URLs, by journal type."""
     there: dict[str, Callable[[], str]] = {SQLITE: lambda: ""}
     try:
         primary = opened.enter_context(postgres.cluster())
@@ -96,7 +96,7 @@ def _groups(rows: Table, size: int, group: int) -> list[list[Incoming]]:
 
 
 def _taken(folder: Path, groups: list[list[Incoming]], new_url: Callable[[], str]) -> dict[str, float]:
-    """Send all samples through a new store; clocks run from the first byte until all samples are in the map."""
+    """Send all samples through a new store; timed from the first byte to the complete map."""
     with tempfile.TemporaryDirectory(dir=folder) as path:
         store = Store(JournalLocation(Path(path), new_url()), SITE, ServerConfig(), lambda: START_NS)
         took = timed(lambda: _take(store, groups))
@@ -108,11 +108,10 @@ def _take(store: Store, groups: list[list[Incoming]]) -> None:
     for group in groups:
         if not all(isinstance(answer, Ack) for answer in store.commit(group)):
             raise RuntimeError("the store refused a batch")
-    store.grid.known_cells()  # folds what waits
+    store.grid.known_cells()  # folds pending samples
 
 
 def _fill(location: JournalLocation, samples: int) -> None:
-    """Samples of a machine as it drives."""
     rows = np.concatenate(list(islice(drive(np.random.default_rng(1)), 1 + samples // LEG_SAMPLES)))
     store = Store(location, SITE, ServerConfig(), lambda: START_NS)
     _take(store, _groups(rows[:samples], SMALLEST, GROUP))
@@ -125,7 +124,7 @@ def _sqlite_bytes(folder: Path, samples: int) -> float:
 
 
 def _postgres_bytes(folder: Path, samples: int, urls: dict[str, Callable[[], str]]) -> float | None:
-    """None where PostgreSQL is not installed."""
+    """None if PostgreSQL is not installed."""
     if POSTGRES not in urls:
         return None
     with postgres.cluster() as cluster:

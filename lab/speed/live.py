@@ -1,8 +1,8 @@
-"""Processor time that a map server at work takes per second of the site's time, by what it does.
+"""CPU time of a working map server per second of site time, by task.
 
-Ten machines send a batch each second. The server's own objects run here: writer, audit, search for changes, snapshots.
-Only the clock is not theirs: a second of the site's time passes as soon as the work of the one before is done, so that
-what comes now and then (judging, snapshots) is measured once and divided by the time between two of them.
+Ten machines send a batch per second to the server's own objects: writer, audit, change search, snapshots. Only time is
+simulated: a second passes when the previous one's work is done. Rare work (judging, snapshots) is measured once and
+divided by its interval.
 """
 
 from __future__ import annotations
@@ -42,11 +42,10 @@ ANSWERED_S = 60.0
 
 
 def run(hours: float, seconds: float) -> Iterator[Row]:
-    """After so many hours of work, over so many seconds of the site's time.
+    """After `hours` of work, over `seconds` of site time.
 
-    Cases are threads: writer, which decodes batches, commits and answers; fold, on the same thread, of what waits at
-    each read; look for changes, with what the writer does for it; audit, which follows the journal and judges;
-    snapshot, of both threads that make it; sum of all.
+    Cases are threads: writer (decode, commit, reply); fold, on the same thread, at each read; look: change search, with
+    its share of the writer; audit (follow the journal, judge); snapshot, both threads; sum.
     """
     warm_up(CONFIG.fold)
     with tempfile.TemporaryDirectory() as folder:
@@ -56,7 +55,7 @@ def run(hours: float, seconds: float) -> Iterator[Row]:
 
 
 def _measured(folder: Path, hours: float, seconds: int) -> dict[str, float]:
-    # no snapshot of its own accord
+    # no automatic snapshot
     config = replace(CONFIG, store=replace(CONFIG.store, snapshot_s=1e6, archive_after_h=0.0))
     writer = Writer(Store(JournalLocation(folder), SITE, config, lambda: START_NS))
     reader = JournalLocation(folder).reader()
@@ -79,14 +78,14 @@ def _measured(folder: Path, hours: float, seconds: int) -> dict[str, float]:
 
 
 class Link:
-    """What a writer takes and answers, and the processor time of its thread."""
+    """A writer's input and output, and its thread's CPU time."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
         self._sent: Counter[str] = Counter()
 
     def send(self, work: Batches) -> None:
-        """Hand in batches, as many at a time as make a group, and wait until they are answered."""
+        """Send batches in groups, awaiting each group's replies."""
         for first in range(0, len(work), GROUP_BATCHES):
             answers: queue.Queue[Ack | Refused] = queue.Queue()
             for name, rows in work[first : first + GROUP_BATCHES]:
@@ -98,18 +97,18 @@ class Link:
                     raise RuntimeError(f"the server refused a batch: {answer}")
 
     def fold(self) -> None:
-        """Have folded what waits."""
+        """Fold pending samples."""
         self._writer.run(lambda store: store.grid.folded)
 
     def cpu_ms(self, work: Callable[[], object], *, own: bool = False) -> float:
-        """Milliseconds of the writer's thread while something is done, and with `own` those of this thread."""
+        """CPU milliseconds of the writer's thread during `work`; with `own` plus this thread's."""
         before_s = self._writer.run(lambda _: time.thread_time())
         own_ms = _own_ms(work)
         return (self._writer.run(lambda _: time.thread_time()) - before_s) * 1e3 + own * own_ms
 
 
 def _each_second(link: Link, audit: Audit, search: ChangeSearch, seconds: Iterator[Batches]) -> dict[str, float]:
-    """Means of what is done every second; for audit the median, which leaves out the turn in which it also judges."""
+    """Means per second; for audit the median, which ignores the judging turn."""
     ms: dict[str, list[float]] = {"writer": [], "fold": [], "look": [], "audit": []}
     for second in seconds:
         ms["writer"].append(link.cpu_ms(lambda: link.send(second)))  # noqa: B023 # called at once

@@ -1,4 +1,4 @@
-"""What the loads share: rows of figures, variants measured in turn, samples to measure with, child processes."""
+"""Shared by the loads: rows of figures, variants in turn, test samples, child processes."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from sitegrid.proof.figures import Row
 from tests.site_work import START_NS
 
 ROOT = Path(__file__).parents[2]
-DIGITS = 4  # significant, of every figure
-SIDE_M = 1024.0  # of the site; three sums for each of its cells of 1 m take 25 MB, more than a cache holds
-Figures = Mapping[str, float | None]  # of one case, by name; None where something is not installed
+DIGITS = 4  # significant digits
+SIDE_M = 1024.0  # of the site; three sums per 1 m cell take 25 MB, more than a cache
+Figures = Mapping[str, float | None]  # of one case by name; None: not installed
 Goals = Mapping[tuple[str, str], str]  # by case and figure: "<= 150", ">= 0.9"
 
 
@@ -35,7 +35,7 @@ def rows_of(case: str, figures: Figures) -> Iterator[Row]:
 
 
 def judged(rows: Iterable[Row], goals: Goals) -> list[Row]:
-    """Rows with the goal of each, None where it has none, and whether it is met."""
+    """Add each row's goal (None: none) and verdict."""
     return [row | _judgement(row["value"], goals.get((row["case"], row["figure"]))) for row in rows]
 
 
@@ -48,7 +48,7 @@ def _judgement(value: float | None, goal: str | None) -> Row:
 
 
 def in_turn(variants: Mapping[str, Callable[[], Figures]], runs: int) -> dict[str, dict[str, float]]:
-    """Median of each figure of each variant; one run of each in turn, so that all meet the same disturbances."""
+    """Median of each variant's figures; runs alternate, so that disturbances hit all alike."""
     measured: dict[str, list[Figures]] = {name: [] for name in variants}
     for _ in range(runs):
         for name, variant in variants.items():
@@ -60,14 +60,14 @@ def in_turn(variants: Mapping[str, Callable[[], Figures]], runs: int) -> dict[st
 
 
 def timed(work: Callable[[], object]) -> dict[str, float]:
-    """Seconds that work took: `wall_s` by the clock, `cpu_s` of this process."""
+    """Duration: `wall_s`, and this process's `cpu_s`."""
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
     work()
     return {"wall_s": time.perf_counter() - start_s, "cpu_s": time.process_time() - start_cpu_s}
 
 
 def track(n: int, seed: int = 0) -> Table:
-    """Samples (n,) half a metre apart along a winding drive, as a machine at work sends them."""
+    """Samples (n,) 0.5 m apart on a winding drive, like a working machine's."""
     draw = np.random.default_rng(seed)
     heading = np.cumsum(draw.normal(0.0, 0.05, n))
     x, y = (SIDE_M / 2 + np.cumsum(0.5 * part(heading)) for part in (np.cos, np.sin))
@@ -75,14 +75,14 @@ def track(n: int, seed: int = 0) -> Table:
 
 
 def scattered(n: int, seed: int = 0) -> Table:
-    """Samples (n,) anywhere on the site, as an archive of many machines is folded."""
+    """Samples (n,) anywhere on the site, like an archive of many machines."""
     draw = np.random.default_rng(seed)
     x, y = draw.uniform(0.0, SIDE_M, (2, n))
     return _fill(n, draw, x, y, draw.uniform(-np.pi, np.pi, n))
 
 
 def _fill(n: int, draw: np.random.Generator, x: Any, y: Any, heading: Any) -> Table:
-    """1.3 m of position error per axis, correlated; 10 ms apart, as from a fleet of 16 machines."""
+    """Correlated position errors of 1.3 m per axis; 10 ms apart, like a fleet of 16."""
     rows = empty(n)
     rows["stamp_ns"] = START_NS + np.arange(n) * 10**7
     rows["x_m"], rows["y_m"], rows["heading_rad"] = x, y, (heading + np.pi) % (2 * np.pi) - np.pi
@@ -95,7 +95,7 @@ def _fill(n: int, draw: np.random.Generator, x: Any, y: Any, heading: Any) -> Ta
 
 
 def in_child(module: str, *words: str) -> dict[str, Any]:
-    """What a module prints as one JSON object when it runs in a process of its own."""
+    """The JSON object printed by a module in its own process."""
     command = [sys.executable, "-m", module, *words]
     result: dict[str, Any] = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True).stdout)  # noqa: S603
     return result
@@ -103,9 +103,9 @@ def in_child(module: str, *words: str) -> dict[str, Any]:
 
 @contextmanager
 def child(module: str, *words: str, end_s: float = 0.0) -> Iterator[list[Figures]]:
-    """A module in a process of its own that prints `ready`; once left, the JSON object that it prints in the end.
+    """Run a module that prints `ready`; after the block, its final JSON object.
 
-    end_s: how long it may take from then on; 0 for one that prints nothing and is ended.
+    end_s: timeout for its end; 0: it prints nothing and is terminated.
     """
     printed: list[Figures] = []
     command = [sys.executable, "-m", module, *words]
@@ -121,10 +121,10 @@ def child(module: str, *words: str, end_s: float = 0.0) -> Iterator[list[Figures
 
 
 def say(what: str) -> None:
-    """Progress, and what could not be measured."""
+    """Print progress, and what could not be measured."""
     print(what, file=sys.stderr, flush=True)
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
+    """The measuring environment."""
     return {"python": platform.python_version(), "numpy": np.__version__, "cores": os.cpu_count()}

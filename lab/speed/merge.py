@@ -1,8 +1,7 @@
-"""The fold of the map server, and plain sums per cell as yardsticks.
+"""The map server's fold, against plain sums per cell.
 
-Every variant takes the same structured rows. Plain sums are added to what is there. Soft votes go into a new grid in
-each run, since ground that is driven again is driven at another time, and count what waits to be folded and settled at
-the end.
+All variants take the same structured rows. Plain sums accumulate. Soft votes start a new grid per run, because repeated
+drives happen at other times, and include folding and settling of pending samples at the end.
 """
 
 from __future__ import annotations
@@ -26,21 +25,21 @@ from sitegrid.proof.figures import Row
 OPTIONS = {"runs": 5, "samples": 200_000}
 GOALS: dict[tuple[str, str], str] = {}
 PATTERNS = {"track": track, "random": scattered}
-BATCH = 100  # samples that a machine sends every few seconds
-PIECE = 5000  # samples of a call in whole runs
+BATCH = 100  # a machine's batch of a few seconds
+PIECE = 5000  # samples per call in whole runs
 BATCHED_SHARE = 10  # batches are measured on a tenth of the samples
-RANDOM_SHARE = 10  # soft votes of scattered samples are measured on a tenth: they are slow
+RANDOM_SHARE = 10  # slow, so measured on a tenth
 YARDSTICK = "np.add.at"
 SECOND_NS = 10**9
-MOST_TOUCHED = 9  # blocks by one sample
+MOST_TOUCHED = 9  # blocks per sample
 SIDE = int(SIDE_M)
 Fold = Callable[[Table], object]
-Start = Callable[[], tuple[Fold, Callable[[], object]]]  # of a run: what folds samples, and what ends the run
+Start = Callable[[], tuple[Fold, Callable[[], object]]]  # of a run: its fold function, and its end
 
 
 @dataclass(frozen=True)
 class SoftVotes:
-    """The server's own fold. read_ns: after so much of the site's time all pages that were touched are read."""
+    """The server's fold. read_ns: touched pages are read at this site-time interval."""
 
     waiting_rows: int
     read_ns: int = 0
@@ -56,11 +55,11 @@ class SoftVotes:
                     for pages in grid.pages(grid.take_touched(len(rows) * MOST_TOUCHED)):
                         len(pages)
 
-        return fold, grid.state  # which folds what waits, and settles all pages
+        return fold, grid.state  # folds pending rows and settles all pages
 
 
 def spans(rows: Table, span_ns: int) -> Iterator[Table]:
-    """Cut samples, in the order of their stamps, where a span of time ends; not at all where it is 0."""
+    """Split samples, sorted by stamp, at multiples of span_ns; 0: not at all."""
     if not span_ns:
         yield rows
         return
@@ -73,12 +72,12 @@ def spans(rows: Table, span_ns: int) -> Iterator[Table]:
 
 
 def sums() -> Floats:
-    """Count, sum and sum of squares per cell (SIDE * SIDE, 3)."""
+    """Count, sum, sum of squares per cell (SIDE * SIDE, 3)."""
     return np.zeros((SIDE * SIDE, 3))
 
 
 def add_at(total: Floats, rows: Table) -> None:
-    """Add c_rr of samples to the sums of their cells by numpy, once per sum."""
+    """Add c_rr to cell sums by numpy, once per sum."""
     cell = rows["y_m"].astype(np.int64) * SIDE + rows["x_m"].astype(np.int64)
     value = rows["c_rr"].astype(np.float64)
     for column, added in zip(total.T, (np.ones_like(value), value, value * value), strict=True):
@@ -86,31 +85,31 @@ def add_at(total: Floats, rows: Table) -> None:
 
 
 def add_by_loop(total: Floats, rows: Table) -> None:
-    """The same in a compiled loop over cells whose three sums lie side by side: a cache miss a sample, not three."""
+    """The same in a compiled loop over interleaved sums: one cache miss per sample, not three."""
     _add(rows, total.reshape(-1), SIDE)
 
 
 @numba.njit(cache=True, nogil=True)
 def _add(rows: Any, total: Any, side: int) -> None:
-    """Indices are unsigned: numba then need not look for negative ones, which count from the end."""
+    """Unsigned indices spare numba the test for negative ones."""
     one, two, three = np.uintp(1), np.uintp(2), np.uintp(3)
     for k in range(len(rows)):
         row = rows[k]
         at = three * (np.uintp(row.y_m) * np.uintp(side) + np.uintp(row.x_m))
-        value = np.float64(row.c_rr)  # float() would leave it single
+        value = np.float64(row.c_rr)  # float() would stay single
         total[at] += 1.0
         total[at + one] += value
         total[at + two] += value * value
 
 
 def _plain(add: Callable[[Floats, Table], None], total: Floats) -> Start:
-    """All runs add to the same sums, whose memory has been touched."""
+    """All runs share sums with touched memory."""
     return lambda: (partial(add, total), lambda: None)
 
 
 def variants() -> dict[str, Start]:
-    """What starts the runs of each variant."""
-    apart = np.zeros((3, SIDE * SIDE)).T  # each sum in one piece, as numpy likes it
+    """Run starters by variant."""
+    apart = np.zeros((3, SIDE * SIDE)).T  # contiguous sums, best for numpy
     return {
         "soft votes, folded again": SoftVotes(REFOLD_ROWS),
         "soft votes, live": SoftVotes(LIVE_ROWS),
@@ -121,10 +120,10 @@ def variants() -> dict[str, Start]:
 
 
 def run(samples: int, runs: int) -> Iterator[Row]:
-    """Every variant on every pattern: whole runs, and batches of 100 as machines send them.
+    """Every variant on every pattern: whole runs, and batches of 100 as from machines.
 
-    msamples_per_s by the clock, cpu_msamples_per_s of processor time, times_add_at: its ratio to the yardstick's;
-    batch_us: of the median call, by the clock; batch_cpu_us: of all calls and the end of the run, per batch.
+    msamples_per_s: wall; cpu_msamples_per_s; times_add_at: ratio to the yardstick; batch_us: median call, wall;
+    batch_cpu_us: total per batch, end included.
     """
     starts = variants()
     for pattern, draw in PATTERNS.items():
@@ -132,7 +131,7 @@ def run(samples: int, runs: int) -> Iterator[Row]:
         parts = {name: drawn[: _share(samples, name, pattern)] for name in starts}
         few = {name: part[: max(BATCH, len(part) // BATCHED_SHARE)] for name, part in parts.items()}
         for name, start in starts.items():
-            took(start, parts[name], PIECE)  # compiled, and every page of memory touched
+            took(start, parts[name], PIECE)  # compiles, touches memory
         whole = in_turn({name: partial(took, start, parts[name], PIECE) for name, start in starts.items()}, runs)
         batched = in_turn({name: partial(took, start, few[name], BATCH) for name, start in starts.items()}, runs)
         pace = {name: len(parts[name]) / max(each["cpu_s"], 1e-9) / 1e6 for name, each in whole.items()}
@@ -148,9 +147,9 @@ def run(samples: int, runs: int) -> Iterator[Row]:
 
 
 def took(start: Start, rows: Table, piece: int) -> dict[str, float]:
-    """One run: `wall_s`, `cpu_s`, and `call_s`, the median of its calls."""
+    """One run: `wall_s`, `cpu_s`, and median call time `call_s`."""
     fold, end = start()
-    fresh = rows.copy()  # is in the caches as after decoding: the first in turn does not load it for the others
+    fresh = rows.copy()  # cached as after decoding, for all variants alike
     calls_s: list[float] = []
 
     def work() -> None:
@@ -164,6 +163,6 @@ def took(start: Start, rows: Table, piece: int) -> dict[str, float]:
 
 
 def _share(samples: int, name: str, pattern: str) -> int:
-    """How many samples are measured, in whole batches."""
+    """Number of measured samples, in whole batches."""
     share = RANDOM_SHARE if pattern == "random" and name.startswith("soft") else 1
     return min(samples, max(1, samples // share // BATCH) * BATCH)

@@ -1,7 +1,7 @@
-"""Milliseconds until a query is answered: a real map server with a day of work, while ten machines go on sending.
+"""Query latency of a real map server with a day of work, while ten machines send.
 
-Each query is followed by one to a service that answers at once with as many bytes: what the journey alone takes. That
-is this module in a process of its own, `python -m lab.speed.query ENDPOINT`.
+Each query is followed by one to a null service that replies with equally many bytes: the transport's share. It is this
+module in its own process, `python -m lab.speed.query ENDPOINT`.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ GOALS = {
     ("warm as_of", "ms_p50"): "<= 30",
 }
 EMPTY_KEY = "bench/empty"
-COLD = 10  # questions to a server that has just come: more of them, and the later ones find what earlier ones left
-SLOW_KINDS = {"as_of": 10, "way": 4}  # one in so many queries is asked of those that take long
+COLD = 10  # queries to a fresh server; with more, later ones would profit from earlier ones
+SLOW_KINDS = {"as_of": 10, "way": 4}  # slow kinds: one in so many queries
 REGION_M, LAYERS = 256.0, ("resistance", "grade", "confidence")
-PLACES = 1000  # of one query for points
+PLACES = 1000  # per points query
 ROUTE_M, CORNER_M = 2000.0, 10.0
-SEARCHED_M, OFF = 500.0, 0.1  # edge of the square that a way is looked for in, and by which share it may differ
+SEARCHED_M, OFF = 500.0, 0.1  # edge of the square searched for a way, and its tolerance
 
 
 def run(hours: float, queries: int) -> Iterator[Row]:
-    """So many queries of each kind after so many hours of work.
+    """Queries of each kind after `hours` of work.
 
-    cold: asked of a server that has just come, one for each kind. warm: asked once before, while samples came in.
+    cold: on a fresh server, one per kind. warm: repeated, while samples arrive.
     """
     work, sent = batches(), Counter[str]()
     before, after = list(islice(work, samples_of(hours) // BATCH)), seconds_of(work)
@@ -94,7 +94,7 @@ def _answered(link: zenoh.Session, queries: Sequence[MapQuery[Any]]) -> Figures:
 
 @contextmanager
 def _at_work(site: Site, seconds: Iterator[Batches], sent: Counter[str]) -> Iterator[None]:
-    """A server that has just come and is done with that, to which machines send."""
+    """A fresh, settled server with sending machines."""
     with site.serving() as server:
         settle(server)
         with meanwhile(partial(_send, site.endpoint, seconds, sent)):
@@ -102,7 +102,7 @@ def _at_work(site: Site, seconds: Iterator[Batches], sent: Counter[str]) -> Iter
 
 
 def _send(endpoint: str, seconds: Iterator[Batches], sent: Counter[str], ended: threading.Event) -> None:
-    """Send every second what machines sample, from a session of its own. sent: samples of each so far."""
+    """Send a second of samples every second, in its own session. sent: samples by machine."""
     with session(endpoint) as link:
         for second in seconds:
             for name, rows in second:
@@ -116,7 +116,7 @@ def _send(endpoint: str, seconds: Iterator[Batches], sent: Counter[str], ended: 
 
 
 def kinds(work: Batches) -> dict[str, Iterator[MapQuery[Any]]]:
-    """Endless queries of each kind after so much work; each about other places. as_of: a point as of any time of it."""
+    """Endless queries by kind, each at another place. as_of: a point at any time of the work."""
     driven = np.concatenate([rows for _, rows in work])
     draw = np.random.default_rng(0)
     order = draw.permutation(len(driven))
@@ -140,7 +140,7 @@ def _some(places: Floats, draw: np.random.Generator) -> tuple[Place, ...]:
 
 
 def _lines(work: Batches, draw: np.random.Generator) -> Iterator[tuple[Place, ...]]:
-    """What a machine drove in a while."""
+    """Lines that machines drove."""
     names = sorted({name for name, _ in work})
     tracks: Sequence[Table] = [np.concatenate([rows for other, rows in work if other == name]) for name in names]
     count, every = round(ROUTE_M / SPACING_M), round(CORNER_M / SPACING_M)
@@ -152,7 +152,7 @@ def _lines(work: Batches, draw: np.random.Generator) -> Iterator[tuple[Place, ..
 
 
 def _ends(places: Floats, draw: np.random.Generator) -> Iterator[tuple[Place, Place]]:
-    """Places between which a way is looked for in a square of about SEARCHED_M, all of it within the site."""
+    """Ends of ways whose search square of about SEARCHED_M is on the site."""
     low, high = places.min(axis=0), places.max(axis=0)
     while True:
         start, end = draw.choice(places, 2, replace=False)
@@ -167,7 +167,7 @@ def _ends(places: Floats, draw: np.random.Generator) -> Iterator[tuple[Place, Pl
 
 
 def serve_empty(endpoint: str) -> None:
-    """Answer at once with as many bytes as are asked for, until ended."""
+    """Reply with the requested number of bytes, until ended."""
     with session(endpoint) as link:
 
         def reply(query: zenoh.Query) -> None:

@@ -1,7 +1,6 @@
-"""How long a map server takes to open a store, or to fold all of its journal again, and what its map takes of memory.
+"""Time to open a store or fold its whole journal, and memory of the map.
 
-A store is opened, a journal folded and a grid filled by processes of their own, `python -m lab.speed.restart WHAT ...`,
-right after the store was written: its files are still in the system's cache.
+Separate processes, `python -m lab.speed.restart WHAT ...`, right after writing, thus from the file cache.
 """
 
 from __future__ import annotations
@@ -49,18 +48,17 @@ GOALS = {
 }
 CONFIG = ServerConfig()
 THIS = "lab.speed.restart"
-TAIL_SAMPLES = RESTART_SAMPLES  # as many as a crash can leave without a snapshot
+TAIL_SAMPLES = RESTART_SAMPLES  # most that a crash leaves without snapshot
 SNAPSHOT_S, DEADLINE_S = 2.0, 120.0
 MB = 1e6
 
 
 def run(samples: int, hours: float, runs: int) -> Iterator[Row]:
-    """Stores of so many samples, and the memory that so many hours of work take.
+    """Stores of `samples`, and memory after `hours` of work.
 
-    open: of a store with a snapshot and a tail, in rows of 100 samples and of 6; process_s: with the start of Python
-    and its imports. fold: of its journal with no snapshot, by threads. grid: of a process that folds the hours of work;
-    server: of a real one that has judged its machines and answered for all of the site, at rest, and the most while it
-    writes a snapshot.
+    open: store with snapshot and tail, in rows of 100 and of 6 samples; process_s: with Python's start and imports.
+    fold: journal without snapshot, by threads. grid: process that folds the work; server: a real one after judging and
+    answering for the whole site, at rest, and the peak during a snapshot.
     """
     for in_row in (BATCH, A_SECOND):
         yield from rows_of(f"open, rows of {in_row}", _opened(samples, in_row))
@@ -108,7 +106,7 @@ def open_store(folder: Path) -> Figures:
 
 
 def fold(folder: Path, threads: int) -> Figures:
-    """Fold a whole journal; RuntimeError where a sample is not in the grid."""
+    """Fold a whole journal; RuntimeError if samples are missing."""
     warm_up(CONFIG.fold)
     grid = Grid(SITE.cell_m, CONFIG.fold)
     with JournalLocation(folder).reader() as journal:
@@ -121,9 +119,9 @@ def fold(folder: Path, threads: int) -> Figures:
 
 
 def fill(hours: float) -> Figures:
-    """Fold so many hours of work in this process, write the grid and read it again.
+    """Fold `hours` of work in this process, write the grid and read it.
 
-    bytes_per_cell_and_bucket: of pages that still hold one bucket; evidence_mb: of all pages.
+    bytes_per_cell_and_bucket: of pages with one bucket; evidence_mb: all pages.
     """
     from mapserver import server  # noqa: F401 # zenoh, sqlite and the plotter's libraries are resident as well
 
@@ -138,7 +136,7 @@ def fill(hours: float) -> Figures:
         "cells": grid.known_cells(),
         "bytes_per_cell_and_bucket": evidence_bytes / max(1, pages),
         "evidence_mb": evidence_bytes / MB,
-        "resident_mb": max(resident_mb, memory_mb()),  # with all pages settled, or with some that wait
+        "resident_mb": max(resident_mb, memory_mb()),  # settled, or with pending pages
         **_snapshot(grid),
     }
 
@@ -159,7 +157,7 @@ def _snapshot(grid: Grid) -> Figures:
 
 
 def served(hours: float) -> Figures:
-    """What a real server takes."""
+    """Memory of a real server."""
     rows, options = samples_of(hours) // BATCH, f"{STORE_OPTIONS}snapshot_s = {SNAPSHOT_S}\n"
     with tempfile.TemporaryDirectory() as path, Site(Path(path), options=options) as site:
         write_store(Path(path), SITE, rows, tail_rows=0)

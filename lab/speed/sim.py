@@ -1,4 +1,4 @@
-"""Simulated seconds per CPU second: drivers, world, all sensors and the truth, but no publishing."""
+"""Simulated seconds per CPU second: drivers, world, sensors, truth; no publishing."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from sim.simulator import Simulator
 from sitegrid.proof.figures import Row
 
 OPTIONS = {"runs": 5, "seconds": 20.0}
-WARM_UP_S = 1.0  # simulated: compiles, and lets the machines set off
+WARM_UP_S = 1.0  # simulated: compiles, starts the machines
 PACE = "sim_s_per_cpu_s"
-# Scenario, world, machines, and the goal of each.
+# Scenario, world, machines, goal.
 FLEETS = (
     ("paper_site", "pybullet", 1, 25.0),
     ("paper_site", "pybullet", 4, 20.0),
@@ -26,7 +26,7 @@ FLEETS = (
 
 
 def case_of(world: str, machines: int) -> str:
-    """The name of a fleet."""
+    """Name of a fleet."""
     return f"{world}, {machines}"
 
 
@@ -34,7 +34,7 @@ GOALS = {(case_of(world, machines), PACE): f">= {goal:g}" for _, world, machines
 
 
 def run(seconds: float, runs: int) -> Iterator[Row]:
-    """Simulate every fleet for so long, each run in a new world, in turn."""
+    """Simulate every fleet, each run in a new world, in turn."""
     variants = {
         case_of(world, machines): partial(_simulated, SimConfig(scenario=name, world=world, machines=machines), seconds)
         for name, world, machines, _ in FLEETS
@@ -44,7 +44,7 @@ def run(seconds: float, runs: int) -> Iterator[Row]:
 
 
 def _simulated(config: SimConfig, seconds: float) -> dict[str, float]:
-    """Simulated seconds per CPU second after the warm-up, and CPU seconds for starting a simulator."""
+    """Simulated seconds per CPU second after warm-up, and CPU seconds to start."""
     start_s = time.process_time()
     simulator = Simulator(config)
     try:

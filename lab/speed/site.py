@@ -1,4 +1,4 @@
-"""A real site on loopback, measured from outside: router, map server, sessions, and machines that send."""
+"""A real site on loopback, measured from outside: router, map server, sessions, sending machines."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from tests.memory import memory_mb
 from tests.site_work import DAY_NS, drive
 
 SITE = SiteConfig("bench", 48.0, 11.0)
-OPTIONS = "[store]\narchive_after_h = 0.0\n"  # samples of a load are older than what a server keeps in its journal
+OPTIONS = "[store]\narchive_after_h = 0.0\n"  # a load's samples are older than the journal's horizon
 READY_S, ANSWER_S = 300.0, 120.0
-SETTLED_CORES, SETTLE_S = 0.1, 300.0  # a server that has just come looks for changes everywhere
-SAMPLES = 10  # in a batch of a fleet
-SESSIONS = 50  # at most: machines share them
+SETTLED_CORES, SETTLE_S = 0.1, 300.0  # a fresh server searches changes everywhere
+SAMPLES = 10  # per batch of a fleet
+SESSIONS = 50  # shared by the machines
 TIMEOUT_S = 10.0  # for an acknowledgement
-RETRY_S = 0.2  # after a refusal that does not say when to come again
+RETRY_S = 0.2  # after a refusal without retry time
 
 
 class Site(Children):
-    """Router and map servers with their store in a folder; leaving the block ends them."""
+    """Router and map servers with a store in a folder, for the length of the block."""
 
     def __init__(self, folder: Path, site: SiteConfig = SITE, options: str = OPTIONS) -> None:
         super().__init__(folder)
@@ -51,11 +51,11 @@ class Site(Children):
         self.router = self.enter_context(self._running("router", "--listen", self.endpoint))
 
     def serving(self) -> AbstractContextManager[int]:
-        """A map server, until left; gives its process id."""
+        """A map server, for the block; yields its process id."""
         return self._running("server", *self._files)
 
     def following(self, name: str) -> AbstractContextManager[int]:
-        """A follower, until left; gives its process id."""
+        """A follower, for the block; yields its process id."""
         return self._running("follow", "--name", name, *self._files)
 
     @property
@@ -84,7 +84,7 @@ def session(endpoint: str) -> Iterator[zenoh.Session]:
 
 
 def ask(link: zenoh.Session, selector: str, payload: bytes | None = None) -> list[bytes]:
-    """All replies to a query; RuntimeError where there is none, or a refusal."""
+    """All replies to a query; RuntimeError if refused or none."""
     replies = list(link.get(selector, payload=payload, timeout=ANSWER_S))
     if not replies or any(reply.ok is None for reply in replies):
         problems = [reply.err.payload.to_bytes() for reply in replies if reply.err is not None]
@@ -93,12 +93,12 @@ def ask(link: zenoh.Session, selector: str, payload: bytes | None = None) -> lis
 
 
 def ask_map(link: zenoh.Session, query: MapQuery[Any]) -> list[bytes]:
-    """All replies to a query of the map."""
+    """All replies to a map query."""
     return ask(link, f"{keys.map_query(SITE.name, query.name)}?{selector_of(query.parameters())}")
 
 
 def send(link: zenoh.Session, batch: SampleBatch, site: str = SITE.name) -> Ack:
-    """Send a batch, and wait for its acknowledgement."""
+    """Send a batch and wait for its acknowledgement."""
     (reply,) = ask(link, keys.ingest(site, batch.machine), encode_batch(batch))
     if not isinstance(answer := decode_reply(reply), Ack):
         raise RuntimeError(f"the server refused a batch: {answer}")
@@ -107,16 +107,16 @@ def send(link: zenoh.Session, batch: SampleBatch, site: str = SITE.name) -> Ack:
 
 @contextmanager
 def meanwhile(work: Callable[[threading.Event], None]) -> Iterator[None]:
-    """Work on a thread of its own, until left. work: is handed an event that is set once it is to end.
+    """Run `work` on a thread during the block; its event is set at the end.
 
-    RuntimeError where it failed.
+    RuntimeError if it failed.
     """
     ended, problems = threading.Event(), list[Exception]()
 
     def run() -> None:
         try:
             work(ended)
-        except Exception as error:  # handed on below
+        except Exception as error:  # re-raised below
             problems.append(error)
 
     thread = threading.Thread(target=run)
@@ -131,7 +131,7 @@ def meanwhile(work: Callable[[threading.Event], None]) -> Iterator[None]:
 
 
 def settle(server: int) -> None:
-    """Wait until a process has little to do."""
+    """Wait until a process is idle."""
     end_s = time.monotonic() + SETTLE_S
     while time.monotonic() < end_s:
         with used(server) as cores:
@@ -143,7 +143,7 @@ def settle(server: int) -> None:
 
 @contextmanager
 def used(*pids: int) -> Iterator[list[float]]:
-    """Cores that processes use while in the block, one figure each, once it is left."""
+    """Cores used by processes during the block, filled at its end."""
     cores: list[float] = []
     before, start_s = [processor_s(pid) for pid in pids], time.monotonic()
     yield cores
@@ -152,13 +152,13 @@ def used(*pids: int) -> Iterator[list[float]]:
 
 
 def processor_s(pid: int) -> float:
-    """Processor time of a process so far."""
+    """CPU time of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def forget_peak_mb(pid: int) -> float:
-    """Have the most memory of a process counted from now on; returns what it has now."""
+    """Reset a process's peak memory; returns the current."""
     Path(f"/proc/{pid}/clear_refs").write_text("5")
     return memory_mb(pid=pid)
 
@@ -168,12 +168,12 @@ def forget_peak_mb(pid: int) -> float:
 
 @dataclass
 class Machine:
-    """One machine: what it sends next, and since when it waits for an acknowledgement."""
+    """One machine: its next batch, and since when it waits for an acknowledgement."""
 
     name: str
     link: zenoh.Session
     samples: Iterator[Table]
-    sent: int = 0  # samples that were acknowledged
+    sent: int = 0  # acknowledged samples
     due_s: float = 0.0
     asked_s: float = 0.0
     payload: bytes = b""
@@ -181,7 +181,7 @@ class Machine:
 
 @dataclass
 class Sent:
-    """What came of the batches of one run. samples: acknowledged; ms: of each batch; took_s: of all."""
+    """Result of a run's batches. samples: acknowledged. ms: per batch. took_s: of all."""
 
     samples: int = 0
     refused: int = 0
@@ -190,7 +190,7 @@ class Sent:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Samples a second, refused batches, and milliseconds until a batch is acknowledged."""
+        """Samples per second, refused batches, milliseconds to acknowledgement."""
         p50, p99 = np.percentile(self.ms, (50, 99)).tolist()
         return {
             "samples_per_s": self.samples / self.took_s,
@@ -201,12 +201,12 @@ class Sent:
 
 
 def fleet(links: Sequence[zenoh.Session], machines: int) -> list[Machine]:
-    """Machines that share sessions, on the day after that of the store."""
+    """Machines on shared sessions, a day after the store's."""
     return [Machine(f"loader-{i:04d}", links[i % len(links)], samples(i)) for i in range(machines)]
 
 
 def samples(seed: int) -> Iterator[Table]:
-    """Batches of one machine, on the day after that of the store."""
+    """Batches of one machine, a day after the store's."""
     for leg in drive(np.random.default_rng([1, seed])):
         leg["stamp_ns"] += DAY_NS
         for first in range(0, len(leg), SAMPLES):
@@ -214,9 +214,9 @@ def samples(seed: int) -> Iterator[Table]:
 
 
 def send_all(machines: Sequence[Machine], seconds: float, period_s: float) -> Sent:
-    """Send for so many seconds, a batch of each machine every period_s, and wait for the last acknowledgements.
+    """Send a batch per machine every period_s, then wait for the last acknowledgements.
 
-    A machine has one batch on its way, as an agent has. period_s: 0 for the next as soon as one is acknowledged.
+    One batch in flight per machine, like an agent. period_s: 0: the next upon acknowledgement.
     """
     answers: queue.SimpleQueue[tuple[int, float, Ack | Refused]] = queue.SimpleQueue()
     start_s, result, waiting = time.monotonic(), Sent(), 0
@@ -247,7 +247,7 @@ def send_all(machines: Sequence[Machine], seconds: float, period_s: float) -> Se
 
 
 def _ask(one: Machine, number: int, answers: queue.SimpleQueue[tuple[int, float, Ack | Refused]]) -> None:
-    """Send the next batch, or the refused one again; its answer comes with the number of its machine."""
+    """Send the next or the refused batch; the reply carries the machine's index."""
     if not one.payload:
         one.payload = encode_batch(SampleBatch(one.name, 1, one.sent + 1, next(one.samples), SITE.frame))
     one.asked_s = time.monotonic()
@@ -261,7 +261,7 @@ def _ask(one: Machine, number: int, answers: queue.SimpleQueue[tuple[int, float,
 
 
 def _take(one: Machine, answer: Ack | Refused, at_s: float, period_s: float, result: Sent) -> None:
-    """Note an answer, and when the machine sends again."""
+    """Record a reply, and schedule the next batch."""
     if isinstance(answer, Ack):
         result.samples += answer.watermark - one.sent
         result.ms.append((at_s - one.asked_s) * 1e3)

@@ -1,6 +1,6 @@
-"""How far a reader walks: the modules that a step of an agent or an answer of the map server passes through.
+"""Code path of a reader: modules passed by an agent's step, or a map server's answer.
 
-moves: from one module of the product to another, in order of the calls; returns: of these, to a module left before.
+moves: from one product module to another, in call order; returns: moves to a module left before.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ GOALS = {
     ("worklist", "returns"): "<= 80",
 }
 PACKAGES = ("agents", "mapserver", "protocol", "sim", "sitegrid")
-FIX = "agents.localisation.gps"  # the module that a step enters with a fix alone
-WARM_S, FOLLOWED_S = 30, 3  # driven before, and while fixes are followed
+FIX = "agents.localisation.gps"  # only steps with a fix enter it
+WARM_S, FOLLOWED_S = 30, 3  # driven before, and while fixes are traced
 
 
 def run(hours: float) -> Iterator[Row]:
-    """A fix in an agent, and questions to a map after so many hours of work."""
+    """A fix in an agent, and map queries after `hours` of work."""
     yield from rows_of("fix", _fix())
     with tempfile.TemporaryDirectory() as path:
         for name, figures in _questions(Path(path), hours):
@@ -64,13 +64,13 @@ def run(hours: float) -> Iterator[Row]:
 
 
 def walked(work: Callable[[], object]) -> list[str]:
-    """The product's modules in the order in which `work` calls into them, on this thread."""
+    """Product modules in the order of calls from `work`, on this thread."""
     modules, frames = list[str](), set[FrameType]()
 
     def note(frame: FrameType, event: str, _: object) -> None:
         name = str(frame.f_globals.get("__name__", ""))
         if event == "call" and frame not in frames and name.partition(".")[0] in PACKAGES:
-            frames.add(frame)  # a generator is called once, and goes on often
+            frames.add(frame)  # generators are called once but resumed often
             modules.append(name)
 
     sys.setprofile(note)
@@ -88,7 +88,7 @@ def counted(modules: list[str]) -> Figures:
 
 
 def _fix() -> Figures:
-    """The shortest step that filters a fix, of the steps of readings that come one by one."""
+    """The shortest fix-filtering step of single readings."""
     pipeline, seconds = Pipeline(agent.SITE, agent.machine(), PipelineConfig()), agent.bundles(WARM_S + FOLLOWED_S)
     for _ in range(WARM_S):
         pipeline.step(next(seconds))
@@ -97,7 +97,7 @@ def _fix() -> Figures:
 
 
 def _questions(folder: Path, hours: float) -> Iterator[tuple[str, Figures]]:
-    """What each question walks, the first of its kind; samples come in before the point on fresh ground."""
+    """Walk of each query, first of its kind; new samples precede the point on fresh ground."""
     rows, work = samples_of(hours) // BATCH, batches()
     write_store(folder, SITE, rows, tail_rows=0)
     sent = list(islice(work, rows))
@@ -106,9 +106,9 @@ def _questions(folder: Path, hours: float) -> Iterator[tuple[str, Figures]]:
     store = Store(JournalLocation(folder), SITE, ServerConfig(), lambda: int(last["stamp_ns"][-1]))
     with closing(Writer(store)) as writer:
         past = StorePast.of_store(folder, SITE.cell_m, writer.config.fold)
-        source = ServerSource(writer, cast(Upkeep, None), past)  # nothing that is asked here asks it
+        source = ServerSource(writer, cast(Upkeep, None), past)  # unused by these queries
         point = PointQuery(x_m, y_m)
-        Answers(source).answer(point)  # settles the ground; each question then has a cache of its own
+        Answers(source).answer(point)  # settles the ground; each query then has its own cache
         questions: dict[str, MapQuery[Any]] = {
             "point, settled": point,
             "why": WhyQuery(x_m, y_m),

@@ -1,1 +1,1 @@
-"""Kinds of machines: bodies, joints and weights, and how steering and engine respond."""
+"""Kinds of machines: bodies, joints, masses, response of steering and engine."""

@@ -1,4 +1,4 @@
-"""Figures of machines that both worlds use: geometry and weight, and the lags of hydraulics and engine."""
+"""Machine figures of both worlds: geometry, weight, lags of hydraulics and engine."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from protocol.arrays import Bools, Floats
 from sim.machines.model import MachineModel
 from sim.state import STEP_S
 
-# Of what the worst soil under a machine's wheels can take, with the torque split in proportion to the wheels' loads,
-# this is the most that traction control allows: a wheel at its peak would spin up without end.
+# Traction control: share of the worst soil's traction, torque split by wheel load. At its peak a wheel would spin up
+# without bound.
 TRACTION_USE = 0.98
 STANDSTILL_MPS = 0.03  # rolling resistance fades in over this speed
-SETTLE_STEPS = 200  # with the brakes on, before a world starts
+SETTLE_STEPS = 200  # steps with the brakes on before a world starts
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """What differs between machines of one kind: true mass, empty [kg], and true wheel radius [m], both (n,).
+    """True empty mass [kg] and wheel radius [m], both (n,), which differ within one kind.
 
-    rolling: factor (n,) on the rolling resistance of the tyres, or one for all.
+    rolling: factor (n,) or scalar on the tyres' rolling resistance.
     """
 
     mass_kg: Floats
@@ -32,10 +32,10 @@ class Bodies:
 
 
 class Chassis(NamedTuple):
-    """Figures of n machines from their models, arrays (n,), named as in `MachineModel`.
+    """Figures of n machines, arrays (n,), named as in `MachineModel`.
 
-    front_share, centre_height: of the empty machine; payload_*: the same for what it carries, alone. *_inertia: about
-    its centre, empty; *_inertia_gain: what each kilogram that it carries adds.
+    front_share, centre_height: of the empty machine; payload_*: of the payload alone. *_inertia: about the centre,
+    empty; *_inertia_gain: per kilogram of payload.
     """
 
     rear_to_joint_m: Floats
@@ -63,10 +63,7 @@ class Chassis(NamedTuple):
 
 
 class Weight(NamedTuple):
-    """Weight of n machines with their payload, all (n,).
-
-    front_share: the front axle's, on the level. centre_height: of the centre of mass; inertias are about it.
-    """
+    """Weight of n machines with payload, all (n,); inertias about the centre of mass, front_share on level ground."""
 
     mass_kg: Floats
     front_share: Floats
@@ -76,14 +73,13 @@ class Weight(NamedTuple):
 
 
 def chassis_of(models: Sequence[MachineModel]) -> Chassis:
-    """Arrays out of one model per machine."""
+    """Stack one model per machine into arrays."""
     kinds = list(dict.fromkeys(models))
     kind, figures = [kinds.index(model) for model in models], [_figures(model) for model in kinds]
     return Chassis(*(np.array([own[name] for own in figures])[kind] for name in Chassis._fields))
 
 
 def _figures(model: MachineModel) -> dict[str, Any]:
-    """Values of the fields of `Chassis`; what a kilogram of payload adds is taken from the full machine."""
     inertia, (payload_x_m, _, payload_z_m) = model.weight().inertia_kgm2, model.payload_centre_m
     gain = (model.weight(model.payload_kg).inertia_kgm2 - inertia) / model.payload_kg
     return vars(model) | {
@@ -101,7 +97,7 @@ def _figures(model: MachineModel) -> dict[str, Any]:
 
 
 def weigh(chassis: Chassis, bodies: Bodies, payload_kg: Floats) -> Weight:
-    """Add payloads (n,) to the empty machines: first moments add up."""
+    """Add payloads (n,) to empty machines."""
     mass = bodies.mass_kg + payload_kg
     share = (bodies.mass_kg * chassis.front_share + payload_kg * chassis.payload_share) / mass
     height = (bodies.mass_kg * chassis.centre_height_m + payload_kg * chassis.payload_height_m) / mass
@@ -111,7 +107,7 @@ def weigh(chassis: Chassis, bodies: Bodies, payload_kg: Floats) -> Weight:
 
 
 def steering_radps(chassis: Chassis, target_rad: Floats, articulation_rad: Floats, rate_radps: Floats) -> Floats:
-    """Rate of articulation after a step: hydraulics close in on the target within their limits, with a lag."""
+    """Rate of articulation after one step: lagged, within the hydraulics' limits."""
     most, fastest = chassis.max_articulation_rad, chassis.steer_radps
     target = np.minimum(np.maximum(target_rad, -most), most)
     rate = chassis.steer_gain_per_s * (target - articulation_rad)
@@ -120,6 +116,6 @@ def steering_radps(chassis: Chassis, target_rad: Floats, articulation_rad: Float
 
 
 def drive_force_n(chassis: Chassis, target_n: Floats, drive_n: Floats, most_n: Floats) -> Floats:
-    """Drive force after a step: the engine follows with a lag, as far as traction control lets it."""
+    """Drive force after one step: lagged, within the traction limit."""
     follows = drive_n + (target_n - drive_n) * (STEP_S / chassis.engine_lag_s)
     return np.minimum(np.maximum(follows, -most_n), most_n)

@@ -1,4 +1,4 @@
-"""Kinds of machines: a URDF file for bodies, joints and sensor places, and a TOML file for everything else."""
+"""Kinds of machines: URDF for bodies, joints and mounts, TOML for the rest."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ WHEELS = tuple(f"{place}_wheel_link" for place in ("front_left", "front_right", 
 
 @dataclass(frozen=True)
 class MachineModel:
-    """One kind of articulated machine on four wheels, as it leaves the works; `sim/machines/*.toml` explain the values.
+    """One kind of articulated machine on four wheels, as delivered; `sim/machines/*.toml` explain the values.
 
-    urdf: file beside the TOML file. mass_kg: empty. payload_kg: the most it carries. load_centre_m: how far ahead of
-    the rear axle the wheel loads' centre lies, empty. skid_grip: of a machine that skid-steers, whose joint only stands
-    for its steering: side force over load of wheels that slide; 0: none do. drive_train: of those that speak CAN.
+    urdf: file beside the TOML file. mass_kg: empty. payload_kg: maximum. load_centre_m: centre of the wheel loads ahead
+    of the rear axle, empty. skid_grip: side force over load of sliding wheels, of skid-steered machines, whose joint
+    only represents steering; 0: none slide. drive_train: of machines with a CAN bus.
     """
 
     name: str
@@ -67,21 +67,21 @@ class MachineModel:
 
     @property
     def wheelbase_m(self) -> float:
-        """From axle to axle, standing straight."""
+        """Distance between axles, machine straight."""
         return self.rear_to_joint_m + self.front_to_joint_m
 
     @property
     def robot(self) -> Robot:
-        """The URDF's content."""
+        """Content of the URDF file."""
         return read_urdf(FOLDER / self.urdf)
 
     @property
     def rolls_with_front(self) -> bool:
-        """Whether the rear frame rolls as the front wheels lie (a swinging rear axle) or as its own do (a hitch)."""
+        """Whether the rear frame rolls with the front wheels (swinging rear axle) or its own (hitch)."""
         return self.robot.joints[WHEELS[2]].parent != BASE
 
     def weight(self, payload_kg: float = 0.0) -> Mass:
-        """Mass, centre and inertia of the machine standing straight, in `base_link`."""
+        """Mass, centre and inertia in `base_link`, machine straight."""
         parts = [(self.robot.place(name, BASE), link.mass) for name, link in self.robot.links.items()]
         load = self.robot.links[PAYLOAD].mass
         share = payload_kg / load.mass_kg
@@ -91,25 +91,25 @@ class MachineModel:
 
     @property
     def payload_centre_m(self) -> Floats:
-        """Where the centre of what it carries lies (3,), in `base_link`, standing straight."""
+        """Centre of the payload (3,) in `base_link`, machine straight."""
         pose = self.robot.place(PAYLOAD, BASE)
         centre: Floats = pose.xyz_m + pose.rotation @ self.robot.links[PAYLOAD].mass.centre_m
         return centre
 
     def front_share(self, payload_kg: float = 0.0) -> float:
-        """Front axle's share of the weight on level ground."""
+        """Share of the front axle on level ground."""
         return float(self.weight(payload_kg).centre_m[0]) / self.wheelbase_m
 
     def centre_height_m(self, payload_kg: float = 0.0) -> float:
-        """Height of the centre of mass above the ground."""
+        """Height of the centre of mass above ground."""
         return float(self.weight(payload_kg).centre_m[2])
 
     def gps_mounts(self) -> tuple[Mount, ...]:
-        """Antennas, in `base_link`."""
+        """Antenna mounts in `base_link`."""
         return tuple(_mount(pose) for frame, pose in self._places("gps") if frame == BASE)
 
     def imu_mounts(self) -> tuple[tuple[str, Mount], ...]:
-        """IMUs: the frame that carries each, and its mount there. The origin of `front_link` is the joint."""
+        """Frame and mount of each IMU. The origin of `front_link` is the joint."""
         return tuple((frame, _mount(pose)) for frame, pose in self._places("imu"))
 
     def _places(self, kind: str) -> list[tuple[str, Transform]]:
@@ -120,7 +120,7 @@ class MachineModel:
 
 @cache
 def load_model(name: str) -> MachineModel:
-    """Read the kind of machine of that name."""
+    """Load a kind of machine."""
     path = FOLDER / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.toml")))
@@ -129,6 +129,6 @@ def load_model(name: str) -> MachineModel:
 
 
 def _mount(pose: Transform) -> Mount:
-    x, y, z = (np.round(pose.xyz_m, 6) + 0.0).tolist()  # no -0.0
+    x, y, z = (np.round(pose.xyz_m, 6) + 0.0).tolist()  # + 0.0 removes -0.0
     roll, pitch, yaw = (np.round(np.degrees(rpy_from_matrix(pose.rotation)), 4) + 0.0).tolist()
     return Mount((x, y, z), (roll, pitch, yaw))

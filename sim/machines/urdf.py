@@ -1,7 +1,7 @@
-"""URDF files: links, joints and places, and the few rigid bodies that a physics engine has to move.
+"""URDF files: links, joints, poses, and their reduction to the bodies that a physics engine moves.
 
-Own code for what our machines need (inertia, boxes to collide, fixed, revolute and continuous joints): PyBullet's
-loader puts the centres of mass of merged links in wrong places, and yourdfpy merges no links and needs a mesh library.
+Own code: PyBullet's loader misplaces the centres of mass of merged links; yourdfpy merges none and needs a mesh
+library.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from protocol.rotations import matrix_from_rpy, rpy_from_matrix
 
 @dataclass(frozen=True)
 class Transform:
-    """A frame in another one: origin (3,) [m] and rotation (3, 3); `a @ b` is b, given in a, in the parent of a."""
+    """Pose in the parent frame: origin (3,) [m], rotation (3, 3). `a @ b`: b, given in a, in the parent of a."""
 
     xyz_m: Floats
     rotation: Floats
@@ -32,7 +32,7 @@ class Transform:
 
 @dataclass(frozen=True)
 class Mass:
-    """A rigid mass: centre (3,) [m] in some frame, inertia (3, 3) [kg m2] about the centre along that frame's axes."""
+    """Rigid mass: centre (3,) [m], inertia (3, 3) [kg m2] about the centre, both along the frame's axes."""
 
     mass_kg: float
     centre_m: Floats
@@ -41,7 +41,7 @@ class Mass:
 
 @dataclass(frozen=True)
 class Box:
-    """A box that collides: its middle in the link, and its size (3,) [m]."""
+    """Collision box: pose in the link, size (3,) [m]."""
 
     pose: Transform
     size_m: Floats
@@ -49,7 +49,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Link:
-    """One link; a mass of 0 is a mere place."""
+    """One link; massless if it only marks a place."""
 
     name: str
     mass: Mass
@@ -58,7 +58,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Joint:
-    """One joint: where the child's frame is at angle 0, and for the turning ones the axis and limits [rad]."""
+    """One joint: the child's pose at angle 0; axis and limits [rad] if it turns."""
 
     name: str
     kind: str
@@ -72,14 +72,14 @@ class Joint:
 
 @dataclass(frozen=True)
 class Robot:
-    """Links by name, and the joint above each of them."""
+    """Links by name, joints by child."""
 
     name: str
     links: dict[str, Link]
-    joints: dict[str, Joint]  # by child
+    joints: dict[str, Joint]
 
     def place(self, link: str, frame: str) -> Transform:
-        """Transform of a link in a frame above it, all joints at angle 0."""
+        """Pose of a link in an ancestor frame, all joints at angle 0."""
         pose = Transform(np.zeros(3), np.eye(3))
         while link != frame:
             joint = self.joints[link]
@@ -87,7 +87,7 @@ class Robot:
         return pose
 
     def carrier(self, link: str, bodies: Iterable[str]) -> str:
-        """Find the first of `bodies` at or above a link."""
+        """First of `bodies` at or above the link."""
         while link not in bodies:
             link = self.joints[link].parent
         return link
@@ -95,7 +95,7 @@ class Robot:
 
 @cache
 def read_urdf(path: Path) -> Robot:
-    """Read a URDF file."""
+    """Parse a URDF file; ConfigError on failure."""
     try:
         root = ET.parse(path).getroot()  # noqa: S314 (the package's own files)
         links = {name: _link(name, e) for e in root.findall("link") if (name := e.attrib["name"])}
@@ -106,7 +106,7 @@ def read_urdf(path: Path) -> Robot:
 
 
 def combined(masses: Iterable[tuple[Transform, Mass]]) -> Mass:
-    """Combine masses, each given in the frame of its pose, into one (parallel axes theorem)."""
+    """Combine masses, each in the frame of its pose (parallel axis theorem)."""
     moved = [(mass.mass_kg, pose @ Transform(mass.centre_m, np.eye(3)), mass.inertia_kgm2) for pose, mass in masses]
     total = sum(kg for kg, _, _ in moved)
     centre = sum((kg * at.xyz_m for kg, at, _ in moved), np.zeros(3)) / max(total, 1e-9)
@@ -118,9 +118,9 @@ def combined(masses: Iterable[tuple[Transform, Mass]]) -> Mass:
 
 
 def rigid_urdf(robot: Robot, bodies: tuple[str, ...], mass_factor: float) -> str:
-    """Rewrite a robot with these links alone, all others joined to the one that carries them (wheels do not turn).
+    """Reduce a robot to these links; all others merge into their carriers, so wheels do not turn.
 
-    In place of PyBullet's URDF_MERGE_FIXED_LINKS. mass_factor: scales all masses.
+    Replaces PyBullet's URDF_MERGE_FIXED_LINKS. mass_factor: scales all masses.
     """
     root = ET.Element("robot", name=robot.name)
     for body in bodies:

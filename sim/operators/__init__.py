@@ -1,1 +1,1 @@
-"""Drivers: routes, pure pursuit along them, and waiting for other machines."""
+"""Drivers: routes, pure pursuit, giving way to other machines."""

@@ -1,4 +1,4 @@
-"""The routes of all machines, and their figures, side by side, so that drivers look all of them up at once."""
+"""All machines' routes in flat arrays, for vectorised drivers."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from sim.machines.model import MachineModel
 from sim.operators.routes import SPACING_M, Leg, Route, speed_limits
 from sim.state import FleetState
 
-BEYOND_M = 24.0  # every leg goes on for so long, for drivers to look ahead
-APART_M = 12.0  # between the joints of machines at the start
+BEYOND_M = 24.0  # length by which every leg is extended, for look-ahead
+APART_M = 12.0  # minimum distance between joints at the start
 
 
 @dataclass(frozen=True)
 class Course:
-    """Legs of n machines one after another. points, limits_mps: of all legs, each from `first` on.
+    """Concatenated legs of n machines. points, limits_mps: per point, each leg from `first` to `last`.
 
-    The other arrays have one value per leg; following: the leg driven after it. payload_kg: NaN where it stays.
+    The rest: per leg. following: next leg. payload_kg: NaN: unchanged.
     """
 
     points: Floats
@@ -37,14 +37,14 @@ class Course:
     following: Ints
 
     def at(self, leg: Ints, distance_m: Floats) -> tuple[Floats, Floats]:
-        """Point (n, 2) after distance_m (n,) along legs (n,), and the direction of the leg there (n, 2)."""
+        """Point and direction (n, 2) after distance_m (n,) along legs (n,)."""
         index, share = self._locate(leg, distance_m)
         here = self.points[index]
         step = self.points[index + 1] - here
         return here + share[:, None] * step, step / self.spacing_m[leg][:, None]
 
     def limit(self, leg: Ints, distance_m: Floats) -> Floats:
-        """Speed to aim at [m/s]."""
+        """Speed limit [m/s]."""
         limit: Floats = self.limits_mps[self._locate(leg, distance_m)[0]]
         return limit
 
@@ -57,7 +57,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a machine begins: leg of the course, distance along it [m], payload [kg], joint (2,) [m], heading [rad]."""
+    """Start: leg, distance along it, payload; joint (2,) and heading in `map`."""
 
     leg: int
     distance_m: float
@@ -68,7 +68,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Crew:
-    """Figures of the machines of n drivers, all (n,), named as in `MachineModel`."""
+    """Machine figures, all (n,), named as in `MachineModel`."""
 
     rear_to_joint_m: Floats
     front_to_joint_m: Floats
@@ -79,7 +79,7 @@ class Crew:
     max_power_w: Floats
 
     def joint_m(self, state: FleetState) -> Floats:
-        """Position (n, 2) of the articulation joint, which follows the route."""
+        """Articulation joint (n, 2), the point that follows the route."""
         x = state.x_m + self.rear_to_joint_m * np.cos(state.yaw_rad)
         return np.stack([x, state.y_m + self.rear_to_joint_m * np.sin(state.yaw_rad)], axis=-1)
 
@@ -114,9 +114,9 @@ def build_course(routes: Sequence[Route], drive_mps: Sequence[float]) -> Course:
 
 
 def spread_starts(routes: Sequence[Route], shares: Sequence[float], apart_m: float = 0.0) -> list[Start]:
-    """Place one machine per route, each after a share (0 to 1) of its cycle, moved on until it is apart from others.
+    """Place one machine per route after a share (0 to 1) of its cycle, moved on until apart_m from the others.
 
-    Raises ValueError where there is no room.
+    ValueError if they do not fit.
     """
     starts: list[Start] = []
     begin = 0
@@ -134,7 +134,6 @@ def spread_starts(routes: Sequence[Route], shares: Sequence[float], apart_m: flo
 
 
 def _start(route: Route, begin: int, share: float) -> Start:
-    """Find the place on the route, and what the machine carries there."""
     distance = share % 1.0 * route.length_m
     number = 0
     while number < len(route.legs) - 1 and distance >= route.legs[number].length_m:
@@ -151,7 +150,7 @@ def _start(route: Route, begin: int, share: float) -> Start:
 
 
 def _beyond(leg: Leg) -> Floats:
-    """Points of a leg with BEYOND_M more: the next lap, or straight on."""
+    """Points of a leg extended by BEYOND_M: the next lap, or straight on."""
     more = math.ceil(BEYOND_M / leg.spacing_m)
     if leg.closed:
         return np.take(leg.points, range(len(leg.points) + more), axis=0, mode="wrap")
@@ -160,5 +159,4 @@ def _beyond(leg: Leg) -> Floats:
 
 
 def _limits(leg: Leg, drive_mps: float, count: int) -> Floats:
-    """Speed limits for the points of `_beyond`."""
     return np.take(speed_limits(leg, drive_mps), range(count), mode="wrap" if leg.closed else "clip")

@@ -1,7 +1,4 @@
-"""Drivers: pure pursuit along routes, forwards and in reverse, a speed controller, stops, and waiting for others.
-
-They follow their routes as near as their habits let them.
-"""
+"""Drivers: pure pursuit in both directions, a speed controller, stops, giving way."""
 
 from __future__ import annotations
 
@@ -15,27 +12,26 @@ from sim.operators.course import BEYOND_M, Course, Crew, Start
 from sim.operators.habits import Habits
 from sim.state import FleetState
 
-DRIVER_STEPS = 5  # of the world: drivers act at 20 Hz
+DRIVER_STEPS = 5  # world steps per action: 20 Hz
 LOOK_AHEAD_M, LOOK_AHEAD_S = 2.5, 0.6
-REVERSE_SHARE = 0.5  # of the speed forwards
-GAIN_PER_S, INTEGRAL_PER_S2 = 2.9, 1.15  # acceleration asked for per m/s of speed error, and per m
+REVERSE_SHARE = 0.5  # speed in reverse over speed forwards
+GAIN_PER_S, INTEGRAL_PER_S2 = 2.9, 1.15  # acceleration per m/s of speed error, and per m of its integral
 START_MPS2, STOP_MPS2 = 0.8, 0.5
-STOP_M, STANDING_MPS = 0.3, 0.03  # a leg's end is reached this close to it, and left once the machine stands
-LOOK_OUT_STEPS = 20  # of the world: drivers look about at 5 Hz
-OVERHANG_M = 2.2  # of frame or bucket beyond an axle
-CLEARANCE_M = 3.6  # between a leg and the middle of another machine: two half widths and a margin
-DISTANCE_M = 3.0  # that is kept to a machine ahead
-PROSPECT_S = (0.0, 1.5, 3.0)  # where others will be, if they go straight on
+STOP_M, STANDING_MPS = 0.3, 0.03  # distance at which a leg's end is reached; speed below which a machine stands
+LOOK_OUT_STEPS = 20  # world steps per look-out: 5 Hz
+OVERHANG_M = 2.2  # frame or bucket beyond an axle
+CLEARANCE_M = 3.6  # from a leg to the middle of another machine: two half widths plus margin
+DISTANCE_M = 3.0  # to the machine ahead
+PROSPECT_S = (0.0, 1.5, 3.0)  # look-ahead times for other machines, at constant velocity
 AHEAD_M = np.arange(2.0, BEYOND_M + 1e-9, 2.0)
 
 
 @dataclass(frozen=True)
 class Drivers:
-    """Memory of n drivers: leg and distance along it [m], speed aimed at [m/s], integral of the controller [N].
+    """State of n drivers: leg, distance along it [m], target speed [m/s], controller integral [N].
 
-    waited_s: how long they have stood at the end of their leg. payload_kg: what they carry. clear_m: distance
-    ahead that is free of other machines. driven_m: distance driven so far. stops: how many of their own they have made;
-    stop_m, stood_s: the distance driven at which the next one is, and how long they have stood there.
+    waited_s: standing time at the leg's end. clear_m: free distance ahead. driven_m: in total. stops: own stops made;
+    stop_m: driven distance of the next; stood_s: standing time there.
     """
 
     leg: Ints
@@ -53,7 +49,7 @@ class Drivers:
 
 @dataclass(frozen=True)
 class DriverCommands:
-    """Commands of n drivers: articulation, drive force, most force of the brakes; and the payload they carry."""
+    """Commands of n drivers: articulation, drive force, brake force limit, payload."""
 
     steer_rad: Floats
     drive_n: Floats
@@ -80,7 +76,7 @@ def at_start(starts: Sequence[Start], habits: Habits) -> Drivers:
 
 
 def no_commands(machines: int) -> DriverCommands:
-    """Commands before drivers act: nothing is asked for."""
+    """Commands before the first step."""
     zero = np.zeros(machines)
     return DriverCommands(zero, zero, zero, zero)
 
@@ -88,8 +84,8 @@ def no_commands(machines: int) -> DriverCommands:
 def drive(
     course: Course, crew: Crew, habits: Habits, old: Drivers, state: FleetState, dt: float
 ) -> tuple[Drivers, DriverCommands]:
-    """Drive one step; returns the drivers' next memory and their commands."""
-    # Where on the leg the machine is; at its end it stops, waits, loads, and takes up the next leg.
+    """Drive one step; returns new drivers and commands."""
+    # Progress on the leg; at its end stop, wait, load, take the next.
     position = crew.joint_m(state)
     arrived = ~course.closed[old.leg] & (course.length_m[old.leg] - old.distance_m < STOP_M)
     standing = np.abs(state.speed_mps) < STANDING_MPS
@@ -101,7 +97,7 @@ def drive(
     arrived &= ~done
     travel = course.travel[leg]
 
-    # Now and then it stops where the driver wants to.
+    # The driver's own stops.
     driven = old.driven_m + np.abs(state.speed_mps) * dt
     at_stop = old.stop_m - driven < STOP_M
     stood = np.where(at_stop & standing, old.stood_s + dt, 0.0)
@@ -110,7 +106,7 @@ def drive(
     stop = np.where(rested, driven + habits.stop(stops)[0], old.stop_m)
     at_stop &= ~rested
 
-    # Steer for a point ahead, as far beside the line as they happen to keep there.
+    # Aim at a point ahead, offset by the driver's wander.
     speed = travel * state.speed_mps
     target_distance = distance + LOOK_AHEAD_M + LOOK_AHEAD_S * np.abs(speed)
     point, direction = course.at(leg, target_distance)
@@ -119,9 +115,9 @@ def drive(
     wheelbase = crew.rear_to_joint_m + crew.front_to_joint_m
     heading = state.yaw_rad + state.articulation_rad * crew.rear_to_joint_m / wheelbase
     steer = travel * pursue(crew, target, np.where(travel < 0, heading + np.pi, heading))
-    steer = np.where(at_stop, state.articulation_rad, steer)  # who steers while he stands folds the machine up
+    steer = np.where(at_stop, state.articulation_rad, steer)  # steering at standstill would fold the machine
 
-    # Keep the speed that the leg allows; gently up, and at once down.
+    # Approach the leg's speed limit gently from below, at once from above.
     limit = np.where(travel < 0, REVERSE_SHARE, 1.0) * course.limit(leg, distance + LOOK_AHEAD_S * speed)
     to_go = np.where(course.closed[leg], np.inf, course.length_m[leg] - distance)
     to_go = np.minimum(to_go, stop - driven)
@@ -129,7 +125,7 @@ def drive(
     limit = np.where(arrived | at_stop, 0.0, np.minimum(limit, np.sqrt(2 * START_MPS2 * old.clear_m)))
     aim = np.minimum(limit, np.maximum(old.aim_mps, 0.0) + START_MPS2 * dt)
     halt = (aim < STANDING_MPS) & (np.abs(speed) < 5 * STANDING_MPS)
-    # At a stop of their own they go on as they came, so the torque against a slope is kept for the start.
+    # At an own stop the integral stays: the start needs its torque against the slope.
     afresh = (halt & ~at_stop) | done
     force, integral = hold_speed(crew, aim, speed, np.where(afresh, 0.0, old.integral_n), dt)
     commands = DriverCommands(
@@ -144,14 +140,14 @@ def drive(
 
 
 def look_out(course: Course, crew: Crew, old: Drivers, state: FleetState) -> Drivers:
-    """Drivers look how far the leg ahead is clear of other machines."""
+    """Update the free distance ahead."""
     return replace(old, clear_m=_clear_distance(course, crew, old.leg, old.distance_m, state))
 
 
 def pursue(crew: Crew, target_m: Floats, heading_rad: Floats) -> Floats:
-    """Articulation (n,) whose circle leads the joint through the target (n, 2), given relative to it in `map`.
+    """Articulation (n,) whose circle leads the joint through the target (n, 2), relative to it in `map`.
 
-    On a circle of curvature k each frame is turned from the joint's track by asin(k l), l from its axle to the joint.
+    With curvature k and distance l from axle to joint, each frame is turned from the joint's track by asin(k l).
     """
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     left = target_m[:, 1] * c - target_m[:, 0] * s
@@ -161,13 +157,13 @@ def pursue(crew: Crew, target_m: Floats, heading_rad: Floats) -> Floats:
 
 
 def bend(rear_m: Floats, front_m: Floats, curvature_pm: Floats) -> Floats:
-    """Articulation [rad] with which the joint drives a circle of this curvature [1/m]."""
+    """Articulation [rad] at which the joint drives a circle of this curvature [1/m]."""
     bent: Floats = np.arcsin(np.clip(rear_m * curvature_pm, -1, 1)) + np.arcsin(np.clip(front_m * curvature_pm, -1, 1))
     return bent
 
 
 def hold_speed(crew: Crew, aim_mps: Floats, speed_mps: Floats, integral_n: Floats, dt: float) -> tuple[Floats, Floats]:
-    """PI controller within the limits of force and power; its integral never leaves them (no wind-up)."""
+    """PI controller within force and power limits, anti wind-up by clamping the integral."""
     error = aim_mps - speed_mps
     strongest = np.minimum(crew.max_drive_n, crew.max_power_w / np.maximum(np.abs(speed_mps), 0.6))
     grown = integral_n + INTEGRAL_PER_S2 * crew.mass_kg * dt * error
@@ -177,7 +173,6 @@ def hold_speed(crew: Crew, aim_mps: Floats, speed_mps: Floats, integral_n: Float
 
 
 def _nearest_distance(course: Course, leg: Ints, distance_m: Floats, position_m: Floats) -> Floats:
-    """Distance along the leg of its point nearest to the machine; a lap's end is its start."""
     nearest, direction = course.at(leg, distance_m)
     distance = distance_m + ((position_m - nearest) * direction).sum(axis=-1)
     length = course.length_m[leg]
@@ -186,7 +181,6 @@ def _nearest_distance(course: Course, leg: Ints, distance_m: Floats, position_m:
 
 
 def _payload(course: Course, old: Drivers, waited_s: Floats, dt: float) -> Floats:
-    """Payloads change evenly while the machines wait."""
     target_kg, wait_s = course.payload_kg[old.leg], course.wait_s[old.leg]
     changes: Bools = (waited_s > 0) & ~np.isnan(target_kg)
     share = dt / np.maximum(wait_s - waited_s + dt, dt)
@@ -194,9 +188,9 @@ def _payload(course: Course, old: Drivers, waited_s: Floats, dt: float) -> Float
 
 
 def _clear_distance(course: Course, crew: Crew, leg: Ints, distance_m: Floats, state: FleetState) -> Floats:
-    """Distance (n,) [m] that each machine can drive before it meets another; infinite where none is near its leg.
+    """Free distance (n,) [m] ahead; infinite if no machine is near the leg.
 
-    Of two machines that block each other the one that is nearer to meeting the other goes first.
+    Of two machines that block each other, the one nearer to the conflict goes first.
     """
     n, travel, joint_m = len(distance_m), course.travel[leg], crew.joint_m(state)
     heading = np.stack([np.cos(state.yaw_rad), np.sin(state.yaw_rad)], axis=-1)

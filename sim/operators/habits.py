@@ -1,7 +1,6 @@
-"""What the lines of a route do not say: drivers wander to their sides, and stop now and then.
+"""Driver habits: lateral wander and random stops.
 
-Everything is drawn before the drive, by distance driven: a driver's habits depend on his machine's generator alone, not
-on what else happens on the site.
+Drawn before the drive by distance driven, so habits depend on the machine's own generator alone.
 """
 
 from __future__ import annotations
@@ -14,21 +13,21 @@ import numpy as np
 from protocol.arrays import Floats, Ints
 from protocol.config import require_between
 
-WANDER_STEP_M, WANDER_STEPS = 2.0, 4096  # between points of a driver's wander; after 8 km it begins again
-RUN_UP_M = 40.0  # machines start on their lines, and are as far from them as they wander after so far
-WIDEST = 2.5  # standard deviations: no driver goes further from his line
-STEEPEST = 0.05  # wander over its length: hydraulics that cannot follow make a machine weave from side to side
-STOPS = 256  # drawn for each driver; then they begin again
-SPREAD = (0.5, 1.5)  # of the distance from stop to stop, over its mean
+WANDER_STEP_M, WANDER_STEPS = 2.0, 4096  # point spacing; points, periodic after 8 km
+RUN_UP_M = 40.0  # wander fades in: machines start on their lines
+WIDEST = 2.5  # clip of the wander in standard deviations
+STEEPEST = 0.05  # most wander over its length: hydraulics lag beyond, and the machine weaves
+STOPS = 256  # drawn per driver, then periodic
+SPREAD = (0.5, 1.5)  # distance between stops over its mean
 
 
 @dataclass(frozen=True)
 class DrivingConfig:
-    """How drivers differ from trains on rails; as it is here, in nothing.
+    """Deviation of drivers from their routes; none by default.
 
-    wander_m: standard deviation of a driver's distance from his line, to either side. wander_length_m: correlation
-    length of that distance, along the way. stop_every_m: mean distance driven between two stops, besides those at the
-    ends of legs; none without it. stop_s: the shortest and the longest of them.
+    wander_m: standard deviation of the lateral offset. wander_length_m: its correlation length along the route.
+    stop_every_m: mean distance between stops, besides those at leg ends; None: no stops. stop_s: shortest and longest
+    stop.
     """
 
     wander_m: float = 0.0
@@ -50,16 +49,16 @@ class DrivingConfig:
 
     @property
     def widest_m(self) -> float:
-        """How far drivers go from their lines at most."""
+        """Largest lateral offset."""
         return WIDEST * self.wander_m
 
 
 @dataclass(frozen=True)
 class Habits:
-    """Habits of n drivers, by the distance that they have driven.
+    """Habits of n drivers by distance driven, periodic.
 
-    left_m: (n, k), how far to the left of its line a machine is to be, in steps of WANDER_STEP_M. gap_m, stop_s: (n, j)
-    from one stop to the next, and how long that lasts. All of them begin again after the last.
+    left_m: lateral offset (n, k), positive left, every WANDER_STEP_M. gap_m, stop_s: distance to the next stop,
+    duration, (n, j).
     """
 
     left_m: Floats
@@ -67,7 +66,7 @@ class Habits:
     stop_s: Floats
 
     def lateral_m(self, driven_m: Floats) -> Floats:
-        """Distance to the left of the line that drivers aim at after a distance driven, both (n,)."""
+        """Target offset (n,) after a distance driven (n,), positive left."""
         steps = driven_m / WANDER_STEP_M
         whole = np.floor(steps)
         number, count, driver = whole.astype(np.int64), self.left_m.shape[1], np.arange(len(steps))
@@ -76,13 +75,13 @@ class Habits:
         return lateral
 
     def stop(self, number: Ints) -> tuple[Floats, Floats]:
-        """Distance (n,) from the stop before to the one with this number (n,), from 0, and how long it lasts [s]."""
+        """Distance from the previous stop to stop `number` (n,), from 0, and its duration [s]."""
         which = np.arange(len(number)), number % self.gap_m.shape[1]
         return self.gap_m[which], self.stop_s[which]
 
 
 def draw_habits(config: DrivingConfig, rngs: Sequence[np.random.Generator]) -> Habits:
-    """Draw the habits of a driver from each generator."""
+    """One driver's habits per generator."""
     n = len(rngs)
     left_m, gap_m, stop_s = np.zeros((n, 1)), np.full((n, 1), np.inf), np.zeros((n, 1))
     if config.wander_m:
@@ -95,10 +94,10 @@ def draw_habits(config: DrivingConfig, rngs: Sequence[np.random.Generator]) -> H
 
 
 def _wander(white: Floats, std_m: float, length_m: float) -> Floats:
-    """A Gauss-Markov process of second order along a ring, out of unit white noise (n, k).
+    """Second-order Gauss-Markov process on a ring, from unit white noise (n, k).
 
-    x'' + 2 b x' + b^2 x = w with b = 2 / length: its correlation over a distance d is (1 + b d) exp(-b d), whose
-    integral is the length. One of first order has no direction anywhere, and cannot be steered along.
+    x'' + 2 b x' + b^2 x = w with b = 2 / length; correlation at distance d: (1 + b d) exp(-b d), with integral
+    `length`. A first-order process has no direction to steer along.
     """
     steps = white.shape[1]
     per_m = 2 * np.pi * np.fft.rfftfreq(steps, WANDER_STEP_M)

@@ -1,4 +1,4 @@
-"""Routes: closed tours or cycles of legs with stops between them, and the speed that their curves allow."""
+"""Routes: closed tours, or cycles of open legs with stops; speed limits in curves."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.rotations import wrap_angle
 
-SPACING_M, FINE_M = 0.5, 0.1  # between points of a leg, and while corners are rounded
-ROUNDING_M = 7.0  # of a right angle this leaves a radius of 0.886 times as much; flatter corners come out wider
+SPACING_M, FINE_M = 0.5, 0.1  # point spacing of legs, and while rounding corners
+ROUNDING_M = 7.0  # a right angle gets 0.886 times this radius, flatter corners more
 LATERAL_MPS2 = 0.9
 BRAKING_MPS2 = 0.5
 
@@ -19,10 +19,10 @@ Corners = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Leg:
-    """A line that a machine's joint follows. points: (k, 2) in `map` [m], in the order driven, spacing_m apart.
+    """Line of the machine's joint. points: (k, 2) in `map` [m], in driving order, spacing_m apart.
 
-    closed: driven round and round, the last point is followed by the first. reverse: driven backwards. At the end of an
-    open leg the machine stops for wait_s and its payload changes to payload_kg (None: it does not).
+    closed: a loop. reverse: driven backwards. At the end of an open leg the machine waits wait_s, then carries
+    payload_kg (None: unchanged).
     """
 
     points: Floats
@@ -34,16 +34,16 @@ class Leg:
 
     @property
     def length_m(self) -> float:
-        """Length from the first point to the last, or of one lap."""
+        """First to last point, or one lap."""
         return (len(self.points) - (not self.closed)) * self.spacing_m
 
     def headings(self) -> tuple[float, float]:
-        """Direction of travel [rad] at the first and at the last point."""
+        """Direction of travel [rad] at the first and last point."""
         first, last = self.points[1] - self.points[0], self.points[-1] - self.points[-2]
         return float(np.arctan2(first[1], first[0])), float(np.arctan2(last[1], last[0]))
 
     def curvature(self) -> Floats:
-        """Signed curvature at every point [1/m], positive to the left; 0 at the ends of an open leg."""
+        """Signed curvature per point [1/m], positive to the left; 0 at the ends of an open leg."""
         step = np.roll(self.points, -1, axis=0) - self.points
         heading = np.arctan2(step[:, 1], step[:, 0])
         turn = wrap_angle(heading - np.roll(heading, 1))
@@ -55,7 +55,7 @@ class Leg:
 
 @dataclass(frozen=True)
 class Route:
-    """What a machine drives again and again: one closed leg, or open ones end to end."""
+    """Cycle of a machine: one closed leg, or open legs end to end."""
 
     legs: tuple[Leg, ...]
 
@@ -65,22 +65,22 @@ class Route:
         return sum(leg.length_m for leg in self.legs)
 
     def reversed(self) -> Route:
-        """The same closed tour driven in the opposite direction."""
+        """The closed tour in the opposite direction."""
         (tour,) = self.legs
         return Route((replace(tour, points=tour.points[::-1].copy()),))
 
 
 def tour(corners: Corners, rounding_m: float = ROUNDING_M) -> Route:
-    """A closed route: a polygon with corners rounded by a Gaussian of `rounding_m` along it."""
+    """Closed route: a polygon, its corners rounded by a Gaussian of `rounding_m` along it."""
     outline = _resample(np.array([*corners, corners[0]], float), FINE_M, closed=True)
     points = _smooth(outline.points, rounding_m / outline.spacing_m)
     return Route((_resample(np.vstack([points, points[:1]]), SPACING_M, closed=True),))
 
 
 def open_leg(corners: Corners, rounding_m: float = ROUNDING_M) -> Leg:
-    """An open leg along corners; it keeps its ends and their directions, where the first and last straight are long."""
+    """Open leg along corners; ends and end directions stay if the first and last straight are long."""
     outline = _resample(np.array(corners, float), FINE_M, closed=False).points
-    # Continued by its point reflections, so that smoothing leaves the ends where they are.
+    # Point reflection keeps the ends in place.
     sigma = rounding_m / FINE_M
     margin = int(5 * sigma) + 1
     line = np.pad(outline, ((margin, margin), (0, 0)), "reflect", reflect_type="odd")
@@ -89,9 +89,9 @@ def open_leg(corners: Corners, rounding_m: float = ROUNDING_M) -> Leg:
 
 
 def speed_limits(leg: Leg, drive_mps: float) -> Floats:
-    """Speed that a driver aims at, at every point: slow in curves, and braking for them in time."""
+    """Target speed per point: limited by lateral acceleration, braking in time."""
     limit = np.minimum(np.sqrt(LATERAL_MPS2 / np.maximum(np.abs(leg.curvature()), 1e-6)), drive_mps)
-    gain, laps = 2 * BRAKING_MPS2 * leg.spacing_m, 1 + leg.closed  # twice round: the seam is treated like the rest
+    gain, laps = 2 * BRAKING_MPS2 * leg.spacing_m, 1 + leg.closed  # two laps, for the seam
     for i in reversed(range(laps * len(limit) - (not leg.closed))):
         k, following = i % len(limit), limit[(i + 1) % len(limit)]
         limit[k] = min(limit[k], np.sqrt(following**2 + gain))
@@ -99,14 +99,14 @@ def speed_limits(leg: Leg, drive_mps: float) -> Floats:
 
 
 def _smooth(points: Floats, sigma: float) -> Floats:
-    """Convolve a closed line of points (k, 2) with a Gaussian of sigma points."""
+    """Convolve a closed line (k, 2) with a Gaussian of `sigma` points."""
     gain = np.exp(-0.5 * (2 * np.pi * np.fft.fftfreq(len(points)) * sigma) ** 2)
     smooth = np.fft.ifft(np.fft.fft(points @ [1, 1j]) * gain)
     return np.stack([smooth.real, smooth.imag], axis=1)
 
 
 def _resample(line: Floats, spacing_m: float, *, closed: bool) -> Leg:
-    """Spread points evenly along a line (k, 2); a closed one comes with its first point at the end again."""
+    """Space points evenly along a line (k, 2); a closed line repeats its first point at the end."""
     at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     count = max(round(at[-1] / spacing_m), 2)
     even = np.linspace(0.0, at[-1], count + 1)[: count if closed else None]

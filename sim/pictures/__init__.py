@@ -1,1 +1,1 @@
-"""A scenario as a person sees it: a plan from above and rendered views."""
+"""Pictures of a scenario: a plan and rendered views."""

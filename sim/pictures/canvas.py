@@ -1,4 +1,4 @@
-"""A picture of ground to draw on in metres: lines with arrows, and labels that find room beside what is drawn."""
+"""Draw on ground in metres: lines with arrows, and labels placed in free room."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from protocol.arrays import AnyArray, Floats
 
 INK, PAPER = (45, 45, 45), (255, 255, 255)
 DASH_PX, ARROW_EVERY_PX = 9, 130
-ARROW_AT = 0.75  # of its part of a line: arrows of short legs that cross in their middle lie apart
+ARROW_AT = 0.75  # share of its piece of line; arrows of short legs that cross in the middle stay apart
 LABEL_SCALE, LABEL_PAD = 0.5, 5
-REACH_PX = (16, 26, 40, 60, 85, 115, 150, 190)  # how far a label may go from its place, the nearest first
+REACH_PX = (16, 26, 40, 60, 85, 115, 150, 190)  # distances of a label from its place, nearest first
 TURNS = np.arange(16) * np.pi / 8
-LEAD_PX = 20.0  # a label farther off is tied to its place by a line
-DRAWN, WRITTEN = 1, 255  # in Canvas.busy: a line that a label had better not cover, a label that it must not
-COVER_COST_PX = 800.0  # a label goes so much farther rather than lie on lines alone
+LEAD_PX = 20.0  # a label farther away gets a leader line
+DRAWN, WRITTEN = 1, 255  # values of Canvas.busy: a line, better not covered; words, never covered
+COVER_COST_PX = 800.0  # detour that a label takes rather than cover lines alone
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """A picture in the making, north up, its south-west corner at the origin of `map`.
+    """Drawing, north up, its south-west corner at the origin of `map`.
 
-    image: drawn on in place. busy: (height, width), what is drawn so far. Places in `px` are (k, 2), right and down.
+    image: drawn on in place. busy: (height, width), what is drawn so far. `px`: (k, 2), right and down.
     """
 
     image: Image
@@ -48,7 +48,7 @@ class Canvas:
         cv2.polylines(self.busy, [_fixed(px)], closed, DRAWN, thick + 5, shift=4)
 
     def arrows(self, px: Floats, colour: Colour, *, both_ways: bool = False) -> None:
-        """Draw heads along a line in the direction of its points, or in both by turns."""
+        """Draw arrow heads along a line, in its direction or alternating."""
         lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(px, axis=0).T))])
         count = max(1, round(lengths[-1] / ARROW_EVERY_PX))
         for k in range(count):
@@ -58,7 +58,7 @@ class Canvas:
             self.head(px[i], sign * (after - before), colour, 8.0)
 
     def head(self, at: Floats, direction: Floats, colour: Colour, size_px: float, edge: Colour = PAPER) -> None:
-        """Draw one arrow head with an edge, its middle on a place."""
+        """Draw one arrow head with an edge, centred on a place."""
         ahead = direction / max(float(np.hypot(*direction)), 1e-9)
         left = np.array([-ahead[1], ahead[0]])
         shape = np.array([1.2 * ahead, 0.8 * left - 0.9 * ahead, -0.5 * ahead, -0.8 * left - 0.9 * ahead])
@@ -75,7 +75,7 @@ class Canvas:
         cv2.circle(self.busy, centre, round(radius_px * 16), DRAWN, cv2.FILLED, shift=4)
 
     def write(self, words: str, middle: Floats, scale: float) -> None:
-        """Write plain words around a place inside the picture; the ground below them pales."""
+        """Write words around a place inside the picture, on a paler background."""
         width, height = text_size(words, scale)
         left, top, right, bottom = self._box(middle, np.array([width / 2 + 2, height / 2 + 2]))
         below = self.image[top : bottom + 1, left : right + 1]
@@ -84,7 +84,7 @@ class Canvas:
         text(self.image, words, (left + 2, bottom - 2), INK, scale)
 
     def label(self, words: str, at: Floats, colour: Colour) -> bool:
-        """Write words in a box near a place, on no other label and away from lines; False where no room is left."""
+        """Write words in a box near a place, off other labels and lines; False if no room is left."""
         width, height = text_size(words, LABEL_SCALE)
         half = np.array([width / 2 + LABEL_PAD, height / 2 + LABEL_PAD])
         shifts = [
@@ -108,7 +108,7 @@ class Canvas:
         return True
 
     def cost(self, middle: Floats, half: Floats) -> float:
-        """What a box around a place would hide: 0 where nothing is drawn, inf on other words or outside."""
+        """Cost of a box: 0 over empty ground, inf over words or outside."""
         left, top, right, bottom = self._box(middle, half)
         height, width = self.busy.shape
         if left < 3 or top < 3 or right > width - 4 or bottom > height - 4:
@@ -122,7 +122,7 @@ class Canvas:
 
 
 def beside(px: Floats, shift_px: float) -> Floats:
-    """A line moved to the right of its direction."""
+    """Shift a line to the right of its direction."""
     ahead = np.gradient(px, axis=0)
     right = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)  # y grows downwards
     moved: Floats = px + shift_px * right / np.maximum(np.hypot(*right.T), 1e-9)[:, None]
@@ -130,7 +130,6 @@ def beside(px: Floats, shift_px: float) -> Floats:
 
 
 def _dashes(px: Floats, *, closed: bool) -> list[Floats]:
-    """Pieces of a line as long as the gaps between them."""
     line = np.vstack([px, px[:1]]) if closed else px
     lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     even = np.linspace(0.0, lengths[-1], 4 * max(1, round(lengths[-1] / DASH_PX / 2)) + 1)
@@ -139,5 +138,5 @@ def _dashes(px: Floats, *, closed: bool) -> list[Floats]:
 
 
 def _fixed(px: Floats) -> AnyArray:
-    """Pixels with four binary places, as OpenCV draws them between the pixels."""
+    """OpenCV's fixed point: four fractional bits."""
     return np.rint(px * 16).astype(np.int32)

@@ -1,4 +1,4 @@
-"""A picture of a scenario: its plan, and below it rendered views of the site and of its machines at work."""
+"""A scenario's picture: the plan, and below it rendered views of site and machines."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from sim.pictures.plan import draw_plan
 from sim.pictures.render import closeup, overview, render
 from sim.simulator import Simulator
 
-DRIVE_S = 20.0  # simulated time after which the views are taken
+DRIVE_S = 20.0  # simulated time before the views
 LEAST_PX, GAP_PX, CAPTION_PX = 1200, 14, 30
-WIDE, TALL = 0.66, 0.37  # the overview's share of the picture's width, and its height over that width
+WIDE, TALL = 0.66, 0.37  # overview: share of the picture's width; its height over its width
 
 
 def draw(config: SimConfig, path: Path) -> list[Path]:
-    """Draw a scenario into one file (format by the suffix); returns what was written, raises OSError."""
+    """Draw a scenario into one file, format by suffix; returns the files written. Raises OSError."""
     simulator = Simulator(config)
     try:
         plan = draw_plan(simulator.scenario, simulator.models, simulator.state)
@@ -35,7 +35,7 @@ def draw(config: SimConfig, path: Path) -> list[Path]:
 
 
 def _views(simulator: Simulator, width: int) -> Image:
-    """The whole site, and beside it a machine of each kind, in a strip of this width [px]."""
+    """The whole site, and beside it one machine of each kind."""
     shown = _kinds(simulator.models)[:2]
     wide = round(WIDE * width)
     narrow, height = width - wide - GAP_PX, round(TALL * width)
@@ -51,7 +51,6 @@ def _views(simulator: Simulator, width: int) -> Image:
 
 
 def _kinds(models: Sequence[MachineModel]) -> list[int]:
-    """The first machine of each kind."""
     return [models.index(kind) for kind in dict.fromkeys(models)]
 
 
@@ -74,7 +73,6 @@ def _column(images: Sequence[Image]) -> Image:
 
 
 def _below(plan: Image, views: Image) -> Image:
-    """Join both: the plan above, the views below, white around both."""
     width = views.shape[1] + 2 * GAP_PX
     plan = np.pad(plan, ((0, GAP_PX), (0, width - plan.shape[1]), (0, 0)), constant_values=255)
     views = np.pad(views, ((0, GAP_PX), (GAP_PX, GAP_PX), (0, 0)), constant_values=255)

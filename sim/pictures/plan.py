@@ -1,4 +1,4 @@
-"""The plan of a scenario from above, to scale: zones, heights, what will change, routes with their stops, machines."""
+"""The plan of a scenario, to scale: zones, heights, coming changes, routes with stops, machines."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from sim.scenario.tables import Scenario, ScheduledChange
 from sim.state import FleetState
 from sim.terrain.terrain import Terrain
 
-WIDTH_PX, HEIGHT_PX = 1380, 900  # of the ground, at most
-PALE = 0.6  # strength of the paper's colours, so that what is drawn on them can be read
+WIDTH_PX, HEIGHT_PX = 1380, 900  # largest size of the ground
+PALE = 0.6  # strength of the zone colours
 LANE_PX = 4.0  # between routes on shared ground
-MAX_NAMED = 12  # machines; more of them are dots
+MAX_NAMED = 12  # more machines are drawn as dots
 MACHINE: Colour = (0, 200, 255)
-CONTOUR_SHARE, CONTOUR_SCALE = 0.2, 0.45  # contours end where the ground has less of the steepest slope than this share
-ROOM_PX = np.array([12.0, 12.0])  # half the sides of what must be free around an arrow or a number
-Stop = tuple[Floats, str, Colour]  # where [px], what happens there
-# Dark, so that they stand out from pale ground, and apart from each other.
+CONTOUR_SHARE, CONTOUR_SCALE = 0.2, 0.45  # contours need this share of the steepest slope
+ROOM_PX = np.array([12.0, 12.0])  # half the size of the room for an arrow or a number
+Stop = tuple[Floats, str, Colour]  # place [px], event
+# Dark, to stand out from pale ground and from each other.
 ROUTE_COLOURS: tuple[Colour, ...] = (
     (130, 30, 10), (150, 0, 140), (10, 70, 150), (20, 20, 20), (10, 90, 10), (30, 10, 130), (110, 100, 0),
 )  # fmt: skip
 
 
 def draw_plan(scenario: Scenario, models: Sequence[MachineModel], start: FleetState) -> Image:
-    """Draw the plan in a frame with axes in metres and a legend. start: of the machines."""
+    """Draw the plan in a frame with axes in metres and a legend. start: state of the machines."""
     ground = scenario.ground
     terrain = build_terrain(replace(ground, roughness_m=0.0), 0)
     px_per_m = min(WIDTH_PX / ground.width_m, HEIGHT_PX / ground.depth_m)
@@ -89,14 +89,13 @@ def _notes(scenario: Scenario, step_m: float) -> list[str]:
 
 
 def _paint(terrain: Terrain, px_per_m: float, step_m: float) -> Image:
-    """Zones in pale colours, with contours."""
     rows, columns = (max(1, round((n - 1) * terrain.cell_m * px_per_m)) for n in terrain.heights_m.shape)
     x, y = np.meshgrid((np.arange(columns) + 0.5) / px_per_m, (np.arange(rows)[::-1] + 0.5) / px_per_m)
     palette = np.array([_pale(zone.bgr) for zone in ZONES], float)
     height, east, north = terrain.surface(x, y)
     slope = np.hypot(east, north)
     steep = slope > CONTOUR_SHARE * max(float(slope.max()), 1e-3)
-    # The distance to the next contour [px] is the height to it over the gradient.
+    # Distance to the next contour [px]: height difference over gradient.
     above = np.abs(height - step_m * np.clip(np.rint(height / step_m), *_levels(height, step_m)))
     distance = np.where(steep, above / np.maximum(slope, 1e-9) * px_per_m, np.inf)
     line = 0.6 * np.clip(1.3 - distance, 0.0, 1.0)[..., None]
@@ -110,19 +109,19 @@ def _pale(colour: Colour) -> Colour:
 
 
 def _contour_step_m(terrain: Terrain) -> float:
-    """A round step that gives few contours."""
+    """A round step for few contours."""
     rise = float(np.ptp(terrain.heights_m))
     return next((step for step in (0.5, 1.0, 2.0, 5.0, 10.0) if rise <= 8 * step), 20.0)
 
 
 def _levels(heights: Floats, step_m: float) -> tuple[int, int]:
-    """The lowest and the highest contour, in steps, between the lowest ground and the highest."""
+    """Lowest and highest contour strictly inside the heights, in steps."""
     lowest, highest = float(heights.min()) / step_m, float(heights.max()) / step_m
     return math.floor(lowest + 1e-6) + 1, math.ceil(highest - 1e-6) - 1
 
 
 def _draw_ramp(canvas: Canvas, ramp: RampConfig, terrain: Terrain, step_m: float) -> None:
-    """An arrow uphill with its angle, and the heights of the contours, where there is most room on the slope."""
+    """Draw an arrow uphill with its angle, and contour heights, where the slope has most room."""
     lines = _across(canvas, ramp, terrain)
     arrows = [canvas.pixels(np.linspace(line[0], line[-1], 9))[1:-1] for line in lines]
     if (best := _freest(canvas, arrows)) is not None:
@@ -140,7 +139,7 @@ def _draw_ramp(canvas: Canvas, ramp: RampConfig, terrain: Terrain, step_m: float
 
 
 def _crossings(line: Floats, terrain: Terrain, step_m: float) -> tuple[Floats, Floats]:
-    """Where a line (k, 2) up or down a slope crosses contours: points (m, 2), and their heights (m,)."""
+    """Contour crossings of a line (k, 2) along a slope: points (m, 2), heights (m,)."""
     heights = terrain.height(line[:, 0], line[:, 1])
     order = np.argsort(heights)
     lowest, highest = _levels(heights, step_m)
@@ -150,14 +149,14 @@ def _crossings(line: Floats, terrain: Terrain, step_m: float) -> tuple[Floats, F
 
 
 def _freest(canvas: Canvas, rows: Sequence[Floats]) -> int | None:
-    """Which row of places (k, 2) [px] hides least; None if all would leave the picture or cover words."""
+    """Index of the row of places (k, 2) [px] that hides least; None if all leave the picture or cover words."""
     costs = [sum(canvas.cost(place, ROOM_PX) for place in row) for row in rows]
     best = int(np.argmin(costs)) if costs else 0
     return best if costs and math.isfinite(costs[best]) else None
 
 
 def _across(canvas: Canvas, ramp: RampConfig, terrain: Terrain) -> list[Floats]:
-    """Lines (k, 2) from foot to top inside the picture, all over the width of a slope; the middle first."""
+    """Lines (k, 2) from foot to top inside the picture, middle first."""
     size = np.array([(n - 1) * terrain.cell_m for n in reversed(terrain.heights_m.shape)])
     side = np.array([-ramp.run_m[1], ramp.run_m[0]]) / np.hypot(*ramp.run_m)
     line = np.array(ramp.foot_m) + np.linspace(0.0, 1.0, 60)[:, None] * ramp.run_m
@@ -168,7 +167,7 @@ def _across(canvas: Canvas, ramp: RampConfig, terrain: Terrain) -> list[Floats]:
 
 
 def _hatch(canvas: Canvas, change: ScheduledChange) -> None:
-    """Show ground that will change: stripes in the colour that it will have, and an outline."""
+    """Hatch ground that will change in its later colour, with an outline."""
     outline = canvas.pixels(np.array(change.outline))
     inside = np.zeros(canvas.busy.shape, np.uint8)
     cv2.fillPoly(inside, [np.rint(outline).astype(np.int32)], 1)
@@ -187,7 +186,7 @@ def _label_change(canvas: Canvas, change: ScheduledChange) -> None:
 
 
 def _draw_route(canvas: Canvas, route: Route, colour: Colour, lane: float, *, both_ways: bool) -> list[Floats]:
-    """Draw the legs; each keeps to its right, so that lines there and back lie apart. Returns their pixels."""
+    """Draw the legs, each shifted to its right, so that both directions stay apart; returns their pixels."""
     lines = []
     for leg in route.legs:
         shift = LANE_PX * (lane if leg.closed else 1.0)
@@ -208,7 +207,7 @@ def _draw_stops(canvas: Canvas, route: Route, lane: Sequence[Floats], colour: Co
 
 
 def stops_of(legs: Sequence[Leg]) -> list[str]:
-    """What happens at the end of each leg, in words; nothing at most changes of direction."""
+    """The event at the end of each leg in words; empty at most changes of direction."""
     known = [leg.payload_kg for leg in legs if leg.payload_kg is not None]
     carried = known[-1] if known else 0.0
     words = []
@@ -223,7 +222,7 @@ def stops_of(legs: Sequence[Leg]) -> list[str]:
 
 
 def _draw_machines(canvas: Canvas, models: Sequence[MachineModel], start: FleetState) -> Floats:
-    """Draw arrow heads, or dots where they are many, at the joints. Returns these places (n, 2) [px]."""
+    """Draw arrow heads at the joints, or dots if there are many; returns the places (n, 2) [px]."""
     ahead = np.stack([np.cos(start.yaw_rad), np.sin(start.yaw_rad)], axis=1)
     rear_m = np.array([model.rear_to_joint_m for model in models])
     places = canvas.pixels(np.stack([start.x_m, start.y_m], axis=1) + rear_m[:, None] * ahead)
@@ -237,7 +236,7 @@ def _draw_machines(canvas: Canvas, models: Sequence[MachineModel], start: FleetS
 
 
 def _label_machines(canvas: Canvas, scenario: Scenario, places: Floats) -> None:
-    """Write the names of a few machines; of many only those of faulty ones."""
+    """Name all machines if they are few, else the faulty ones."""
     faulty = {fault.machine for fault in scenario.fault}
     for name, at in zip(scenario.machine_names, places, strict=True):
         if len(places) <= MAX_NAMED or name in faulty:

@@ -1,4 +1,4 @@
-"""A rendered view of a site and its machines, by PyBullet's software renderer."""
+"""Rendered views of a site and its machines, by PyBullet's software renderer."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from sim.state import FleetState
 from sim.terrain.terrain import Terrain
 from sim.worlds.bullet_client import pybullet
 
-MESH_M, MAX_NODES = 1.0, 60_000  # between the nodes of the drawn ground; of a large site it is more
-TEXEL_M, MAX_TEXELS = 0.1, 6_000_000  # size of a texel, likewise
-MARGIN = 0.04  # of an overview's frame, around the site
+MESH_M, MAX_NODES = 1.0, 60_000  # node spacing of the drawn ground; coarser on large sites
+TEXEL_M, MAX_TEXELS = 0.1, 6_000_000  # texel size, likewise
+MARGIN = 0.04  # share of an overview's frame left around the site
 SKY_RGB = (196, 214, 232)
-GRAIN = 0.06  # brightness noise of the ground, so that an eye sees it move and bend
-SUN = (-0.8, 0.45, 1.0)  # in the north-west, as on maps: slopes that face it are brighter
-RELIEF = 1.1  # how much brighter, per unit of gradient
-SHADE = 0.5  # of the ground under a machine
+GRAIN = 0.06  # brightness noise, so that the ground's shape and motion are visible
+SUN = (-0.8, 0.45, 1.0)  # from the north-west, as on maps
+RELIEF = 1.1  # brightness per unit of gradient
+SHADE = 0.5  # brightness under a machine
 SKIRT_M = 5.0  # depth of the block that the site is cut out of
 SKIRT_RGBA = (0.42, 0.36, 0.30, 1.0)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where to look at [m], from how far, turned from north clockwise, and from how high above the horizon [deg]."""
+    """target [m], distance [m], yaw from north clockwise [deg], pitch above the horizon [deg]."""
 
     target_m: tuple[float, float, float]
     distance_m: float
@@ -43,7 +43,7 @@ class Camera:
 
 
 def overview(terrain: Terrain, width: int = 1280, height: int = 720) -> Camera:
-    """The closest camera that sees the whole site, in a picture of this size [px]."""
+    """Closest camera that sees the whole site, in a picture of this size [px]."""
     camera = Camera((0.0, 0.0, 0.0), 1.0, yaw_deg=16.0, pitch_deg=43.0, width=width, height=height)
     depth_m, width_m = (terrain.cell_m * (n - 1) for n in terrain.heights_m.shape)
     low, high = float(terrain.heights_m.min()) - SKIRT_M, float(terrain.heights_m.max())
@@ -51,7 +51,7 @@ def overview(terrain: Terrain, width: int = 1280, height: int = 720) -> Camera:
     right, up, forward = _axes(camera)
     upwards = (1 - MARGIN) * np.tan(np.radians(camera.view_deg / 2))
     distance, target = 0.0, corners.mean(axis=0)
-    # A corner p is inside where |axis . (p - target)| <= slope * (distance + forward . (p - target)).
+    # A corner p is inside if |axis . (p - target)| <= slope * (distance + forward . (p - target)).
     for axis, slope in ((right, upwards * width / height), (up, upwards)):
         across, away = (corners - target) @ axis, slope * ((corners - target) @ forward)
         most, least = float((across - away).max()), float((across + away).min())
@@ -62,7 +62,7 @@ def overview(terrain: Terrain, width: int = 1280, height: int = 720) -> Camera:
 
 
 def _axes(camera: Camera) -> Floats:
-    """Right, up and forward of a camera in `map`, one per row."""
+    """Right, up, forward of a camera in `map`, one per row."""
     yaw, pitch = np.radians([camera.yaw_deg, camera.pitch_deg])
     right = [np.cos(yaw), np.sin(yaw), 0.0]
     forward = [-np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), -np.sin(pitch)]
@@ -70,9 +70,9 @@ def _axes(camera: Camera) -> Floats:
 
 
 def closeup(state: FleetState, machine: int, model: MachineModel, width: int = 1280, height: int = 720) -> Camera:
-    """A camera beside and ahead of one machine, for a picture of this size [px]."""
+    """Camera beside and ahead of one machine, in a picture of this size [px]."""
     x, y, z, yaw = (float(v[machine]) for v in (state.x_m, state.y_m, state.z_m, state.yaw_rad))
-    ahead_m = 0.6 * model.wheelbase_m  # about the middle of a machine
+    ahead_m = 0.6 * model.wheelbase_m  # about the machine's middle
     target = (x + ahead_m * np.cos(yaw), y + ahead_m * np.sin(yaw), z + 1.0)
     away_m = model.wheelbase_m * max(2.7, 3.6 * height / width)
     turned = float(np.degrees(yaw)) + 35.0
@@ -82,10 +82,7 @@ def closeup(state: FleetState, machine: int, model: MachineModel, width: int = 1
 def render(
     terrain: Terrain, models: Sequence[MachineModel], state: FleetState, cameras: Sequence[Camera]
 ) -> list[AnyArray]:
-    """Draw the machines of a state on their ground, a picture for each camera.
-
-    A picture is (height, width, 3) uint8; blue, green, red as OpenCV has it.
-    """
+    """Draw machines on their ground; one picture (height, width, 3) uint8 BGR per camera."""
     client = pybullet.connect(pybullet.DIRECT)
     try:
         with TemporaryDirectory() as folder:
@@ -131,7 +128,7 @@ def _strip(start: Floats, end: Floats, half_m: float) -> Floats:
 
 
 def _ground(client: int, terrain: Terrain, shades: list[Floats], folder: Path) -> None:
-    """Put the ground up as a mesh with a picture of its zones on it."""
+    """Create the ground as a mesh textured with its zones."""
     rows, columns = terrain.heights_m.shape
     size_m = (columns - 1) * terrain.cell_m, (rows - 1) * terrain.cell_m
     mesh_m = max(MESH_M, float(np.sqrt(np.prod(size_m) / MAX_NODES)))
@@ -152,7 +149,7 @@ def _ground(client: int, terrain: Terrain, shades: list[Floats], folder: Path) -
 
 
 def _skirt(client: int, path: Path, edge: Floats, floor_m: float) -> None:
-    """Close the side below an edge (3, k) of the ground, so that the site looks like a solid block."""
+    """Close the side below an edge (3, k) of the ground, so that the site looks solid."""
     x, y, z = (
         np.stack([below, above])
         for below, above in zip((*edge[:2], np.full(edge.shape[1], floor_m)), edge, strict=True)
@@ -165,7 +162,7 @@ def _skirt(client: int, path: Path, edge: Floats, floor_m: float) -> None:
 
 
 def _picture(terrain: Terrain, shades: list[Floats], width_m: float, depth_m: float) -> AnyArray:
-    """The zones from above in the paper's colours, softened and grained, dark under machines; north is up."""
+    """Zones from above, blurred and grained, dark under machines; north up."""
     texel_m = max(TEXEL_M, float(np.sqrt(width_m * depth_m / MAX_TEXELS)))
     x = np.arange(texel_m / 2, width_m, texel_m)
     y = np.arange(texel_m / 2, depth_m, texel_m)[::-1]
@@ -187,7 +184,7 @@ def _picture(terrain: Terrain, shades: list[Floats], width_m: float, depth_m: fl
 
 
 def _wavefront(x: Floats, y: Floats, z: Floats) -> str:
-    """A grid of nodes as a Wavefront OBJ mesh, texture stretched over it."""
+    """A grid of nodes as a textured Wavefront OBJ mesh."""
     rows, columns = x.shape
     vertices = [f"v {a:.3f} {b:.3f} {c:.3f}" for a, b, c in zip(x.ravel(), y.ravel(), z.ravel(), strict=True)]
     u, v = x / max(x.max(), 1.0), y / max(y.max(), 1.0)

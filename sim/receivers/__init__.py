@@ -1,1 +1,1 @@
-"""Receivers of simulated machines: what they measure as the bytes that real ones send, on ports that programs open."""
+"""Receivers of simulated machines: measurements as the bytes of real receivers, on ports."""

@@ -1,4 +1,4 @@
-"""What a receiver knows at one instant, whatever format it speaks."""
+"""What a receiver knows at one instant, in any format."""
 
 import math
 from datetime import UTC, datetime
@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 from protocol.machine.readings import Gps, GpsVelocity
 
-SATELLITES = 18  # that a receiver uses under open sky
-GEOID_M = 47.0  # height of the geoid above the ellipsoid, of receivers that state both heights; as around Karlsruhe
-# Horizontal standard deviations up to which a fix counts as one of that quality [m].
+SATELLITES = 18  # used under open sky
+GEOID_M = 47.0  # geoid above the ellipsoid near Karlsruhe, for receivers that state both heights
+# Largest horizontal standard deviation of each fix quality [m].
 QUALITIES = {"fixed": 0.05, "float": 0.5, "differential": 3.0, "autonomous": math.inf}
-SEMI_MAJOR_M, ECCENTRICITY_2 = 6_378_137.0, 6.694_379_990_14e-3  # of the ellipsoid of WGS 84
+SEMI_MAJOR_M, ECCENTRICITY_2 = 6_378_137.0, 6.694_379_990_14e-3  # ellipsoid of WGS 84
 
 
 class Baseline(NamedTuple):
-    """From another antenna of the machine to this one [m], north, east and down; std_rad: of its direction."""
+    """Vector from another antenna of the machine to this one; std_rad: of its direction."""
 
     north_m: float
     east_m: float
@@ -28,7 +28,7 @@ class Baseline(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """An instant of a receiver. fix: None while it has none; baseline: None where it is not known by carrier phase."""
+    """Instant of a receiver. fix: None without one. baseline: None without carrier phase."""
 
     utc_ns: int
     fix: Gps | None = None
@@ -37,17 +37,17 @@ class Epoch(NamedTuple):
 
     @property
     def time(self) -> datetime:
-        """UTC to the second."""
+        """UTC, whole seconds."""
         return datetime.fromtimestamp(self.utc_ns // 10**9, UTC)
 
 
 def quality(fix: Gps) -> str:
-    """One of QUALITIES, by the standard deviation that it states."""
+    """Key of QUALITIES for the stated standard deviation."""
     return next(name for name, most_m in QUALITIES.items() if fix.var_e_m2**0.5 <= most_m)
 
 
 def baseline(base: Gps, rover: Gps) -> Baseline | None:
-    """Between two antennas, by their fixes of one instant; None unless both are fixed by carrier phase."""
+    """Baseline between simultaneous fixes; None unless both are fixed by carrier phase."""
     if quality(base) != "fixed" or quality(rover) != "fixed":
         return None
     lat = math.radians(base.lat_deg)

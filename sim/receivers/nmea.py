@@ -1,4 +1,4 @@
-"""NMEA 0183 as receivers write it: sentences with their decimals, in the order in which u-blox receivers send them."""
+"""NMEA 0183 with real receivers' decimals, in u-blox order."""
 
 import math
 from functools import reduce
@@ -7,22 +7,22 @@ from operator import xor
 from agents.drivers.formats.nmea import KNOT_MPS
 from sim.receivers.epoch import GEOID_M, SATELLITES, Epoch, quality
 
-NUMBERS = {"autonomous": 1, "differential": 2, "fixed": 4, "float": 5}  # of GGA
-MODES = {"autonomous": "A", "differential": "D", "fixed": "R", "float": "F"}  # of RMC and VTG
+NUMBERS = {"autonomous": 1, "differential": 2, "fixed": 4, "float": 5}  # fix quality in GGA
+MODES = {"autonomous": "A", "differential": "D", "fixed": "R", "float": "F"}  # mode in RMC and VTG
 HDOP = 0.7  # under open sky
-SLOW_MPS = 0.1  # below it a receiver states no course
+SLOW_MPS = 0.1  # below it no course is stated
 
 
 def sentence(text: str) -> bytes:
-    """A sentence with its checksum."""
+    """Add start and checksum."""
     return f"${text}*{reduce(xor, text.encode()):02X}\r\n".encode()
 
 
 class NmeaWriter:
-    """Writes what one receiver sends of an epoch. Those fixed by carrier phase state 7 decimals of a minute, else 5."""
+    """Sentences of one receiver. Fixes by carrier phase have 7 decimals of a minute, others 5."""
 
     def epoch(self, epoch: Epoch) -> bytes:
-        """RMC, VTG, GGA, GST, and THS where there is a baseline."""
+        """RMC, VTG, GGA, GST, and THS if there is a baseline."""
         texts = [_rmc(epoch), _vtg(epoch), _gga(epoch), _gst(epoch)]
         if epoch.baseline:
             texts.append(f"GNTHS,{_course(epoch.baseline.heading_rad)},A")
@@ -63,7 +63,6 @@ def _time(epoch: Epoch) -> str:
 
 
 def _place(epoch: Epoch) -> str:
-    """Latitude, N or S, longitude, E or W; empty fields without a fix."""
     if not epoch.fix:
         return ",,,"
     decimals = 7 if quality(epoch.fix) == "fixed" else 5
@@ -79,7 +78,7 @@ def _minutes(degrees: float, width: int, decimals: int) -> str:
 
 
 def _motion(epoch: Epoch) -> tuple[str, str]:
-    """Speed [kn] and course [deg]; a slow machine has no course."""
+    """Speed [kn] and course [deg], which slow machines lack."""
     if not (epoch.fix and epoch.motion):
         return "", ""
     east_mps, north_mps = epoch.motion.velocity_e_mps, epoch.motion.velocity_n_mps
@@ -89,5 +88,5 @@ def _motion(epoch: Epoch) -> tuple[str, str]:
 
 
 def _course(angle_rad: float) -> str:
-    """Degrees, 0.00 to 359.99."""
+    """0.00 to 359.99 degrees."""
     return f"{round(math.degrees(angle_rad) % 360, 2) % 360:.2f}"

@@ -1,4 +1,4 @@
-"""Ports of simulated receivers: pseudo terminals, under names in a folder, as serial ports are under /dev/serial."""
+"""Ports of simulated receivers: named pseudo terminals in a folder, like /dev/serial."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from sim.sensors.rigs import Rig
 
 
 class PseudoTerminal:
-    """A pseudo terminal. Bytes that nobody listens to are lost, as on a wire."""
+    """A pseudo terminal. Without a reader bytes are lost, as on a wire."""
 
     def __init__(self, path: Path) -> None:
-        """Raises ConfigError where a file has the name."""
+        """ConfigError if a file has the name."""
         self._path = path
         self._end, listener = os.openpty()
         tty.setraw(listener)
         os.set_blocking(self._end, False)
         self._name = name = os.ttyname(listener)
-        os.close(listener)  # from now on the system tells whether somebody listens
+        os.close(listener)  # from now on the system reports whether there is a reader
         try:
             if path.is_symlink():
-                path.unlink()  # of a simulator that was killed
+                path.unlink()  # left by a killed simulator
             path.symlink_to(name)
         except OSError as error:
             os.close(self._end)
             raise ConfigError(path, f"no port can be there ({error.strerror}): choose another folder") from None
 
     def write(self, data: bytes) -> None:
-        """Send to whoever listens; what does not fit into the system's buffer is lost."""
+        """Send to the reader; an overflow of the system's buffer is lost."""
         ready = select.poll()
         ready.register(self._end, select.POLLOUT)
         if any(event & select.POLLOUT and not event & select.POLLHUP for _, event in ready.poll(0)):
@@ -44,14 +44,14 @@ class PseudoTerminal:
                 os.write(self._end, data)
 
     def close(self) -> None:
-        """Unplug it."""
+        """Remove the port."""
         if self._path.is_symlink() and str(self._path.readlink()) == self._name:
             self._path.unlink()
         os.close(self._end)
 
 
 class Ports:
-    """The ports of all machines of a simulation. folder: is made if need be."""
+    """Ports of all simulated machines. folder: created if missing."""
 
     def __init__(self, folder: Path, machines: Mapping[str, Sequence[Wiring]]) -> None:
         self._receivers: dict[str, list[tuple[SimulatedReceiver, PseudoTerminal]]] = {}
@@ -67,19 +67,19 @@ class Ports:
             raise
 
     def send(self, machine: str, readings: Sequence[Reading]) -> tuple[Reading, ...]:
-        """Send what the machine's receivers carry over their ports; returns all other readings."""
+        """Send the readings of the machine's receivers over their ports; returns the others."""
         for receiver, port in self._receivers[machine]:
             port.write(receiver.speak(readings))
         return tuple(reading for reading in readings if reading.sensor not in self._carried[machine])
 
     def close(self) -> None:
-        """Unplug all."""
+        """Remove all ports."""
         for _, port in (each for opened in self._receivers.values() for each in opened):
             port.close()
 
 
 def driver_toml(folder: Path, wirings: Sequence[Wiring], rig: Rig) -> str:
-    """[[driver]] tables of an agent that reads these ports, and from bundles what neither they nor a bus carries."""
+    """Agent's [[driver]] tables: these ports, and bundles for what neither ports nor a bus carry."""
     tables = [
         f"kind = {json.dumps(w.format)}\naddress = {json.dumps(str(folder.absolute() / w.name))}\n"
         + _feeds({stream: sensor.name for stream, sensor in w.feeds.items()})

@@ -1,4 +1,4 @@
-"""Receivers of simulated machines: readings in, bytes out, with the quantisation of their formats. Pure."""
+"""Simulated receivers: readings in, bytes out, quantised by their formats. Pure."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WRITERS: dict[str, Callable[[], UbxWriter | NmeaWriter]] = {UBX: UbxWriter, NMEA
 class Wiring:
     """A receiver of a machine.
 
-    period_ns: between epochs. feeds: the sensor of each stream. base: the antenna from which it has its heading.
+    period_ns: between epochs. feeds: sensor per stream. base: antenna from which its heading is measured.
     """
 
     name: str
@@ -35,20 +35,19 @@ class Wiring:
 
     @property
     def added(self) -> tuple[SensorConfig, ...]:
-        """Sensors that the receiver makes of others."""
+        """Sensors that the receiver derives from others."""
         return tuple(sensor for stream, sensor in self.feeds.items() if stream == HEADING)
 
 
 def carried(wirings: Sequence[Wiring]) -> frozenset[str]:
-    """The sensors whose readings receivers send."""
+    """Names of all sensors sent by receivers."""
     return frozenset(sensor.name for wiring in wirings for sensor in wiring.feeds.values())
 
 
 def wire(rig: Rig, format_: str) -> list[Wiring]:
-    """The receivers of a machine, one for each antenna; the first also has an IMU and wheel ticks if it speaks UBX.
+    """One receiver per antenna; a first one with UBX also has an IMU and wheel ticks.
 
-    Where they are fixed by carrier phase the second antenna gives a heading, from the first one. What no receiver
-    carries, as torque, is in none of them.
+    If fixed by carrier phase, the second antenna has a heading, from the first. Other sensors, like torque, stay out.
     """
     machine, period_ns = rig.machine, 10**9 // rig.preset.gps.rate_hz
     by_kind = {kind: [s for s in machine.sensors if s.kind == kind] for kind in STREAMS.values()}
@@ -70,14 +69,14 @@ def _is_fixed(noise: GpsNoise) -> bool:
 
 
 def _compass(base: SensorConfig, rover: SensorConfig) -> SensorConfig:
-    """A heading of two antennas as a sensor: its x points from the first to the second."""
+    """Two antennas as a heading sensor, x from the first to the second."""
     ahead_m, left_m = (b - a for a, b in zip(base.mount.xyz_m[:2], rover.mount.xyz_m[:2], strict=True))
     mount = replace(rover.mount, rpy_deg=(0.0, 0.0, round(degrees(atan2(left_m, ahead_m)), 2)))
     return SensorConfig("antennas", STREAMS[HEADING], mount, measures=("heading",))
 
 
 class SimulatedReceiver:
-    """One receiver; without a fix it says so at each epoch."""
+    """One receiver; without a fix every epoch says so."""
 
     def __init__(self, wiring: Wiring) -> None:
         self._wiring = wiring
@@ -85,7 +84,7 @@ class SimulatedReceiver:
         self._due_ns = 0
 
     def speak(self, readings: Sequence[Reading]) -> bytes:
-        """What it sends of a machine's readings, which are in the order of their stamps."""
+        """Bytes for a machine's readings, ordered by stamp."""
         spoken = bytearray()
         for stamp_ns, group in groupby(readings, lambda reading: reading.stamp_ns):
             spoken += self._speak_of(stamp_ns, {reading.sensor: reading for reading in group})

@@ -1,6 +1,6 @@
-"""u-blox's UBX as its receivers write it: frames by the interface descriptions M8 to F9, in their integer units.
+"""u-blox UBX, frames by the interface descriptions M8 to F9 in their integer units.
 
-What reads them is `agents/drivers/formats/ubx.py`; the scales of ESF-MEAS are told there.
+Reader, and scales of ESF-MEAS: `agents/drivers/formats/ubx.py`.
 """
 
 import math
@@ -13,10 +13,10 @@ from agents.drivers.formats.ubx import BACKWARD, FORCES, GYROS, MPS2_PER_LSB, RA
 from protocol.machine.readings import Encoder, Imu
 from sim.receivers.epoch import GEOID_M, SATELLITES, Epoch, quality
 
-LEAP_S = 18  # that GPS time is ahead of UTC since 2017
+LEAP_S = 18  # GPS time ahead of UTC since 2017
 GPS_BEGAN_S = 315_964_800  # 1980-01-06 in UTC
 WEEK_S = 604_800
-VALID = 7  # flags of NAV-PVT: date and time are valid, leap seconds known
+VALID = 7  # NAV-PVT: date and time valid, leap seconds known
 FLAGS = {"autonomous": 1, "differential": 1 | 1 << 1, "float": 1 | 1 << 1 | 1 << 6, "fixed": 1 | 1 << 1 | 2 << 6}
 RELATIVE = 1 | 1 << 1 | 1 << 2 | 2 << 3 | 1 << 5 | 1 << 8  # fix, differential, valid, fixed, moving base, heading valid
 REAR_WHEELS = (8, 9)  # data types of ESF-MEAS, left and right
@@ -58,32 +58,32 @@ class NavPvt(NamedTuple):
     flags3: int = 0
 
     def frame(self) -> bytes:
-        """As it is sent."""
+        """As sent."""
         return frame(0x01, 0x07, _PVT.pack(*self))
 
 
 def frame(kind: int, identity: int, payload: bytes) -> bytes:
-    """A frame with its checksum (Fletcher's)."""
+    """Add header and Fletcher checksum."""
     counted = pack("<BBH", kind, identity, len(payload)) + payload
     return b"\xb5b" + counted + bytes((sum(counted) & 255, sum(accumulate(counted)) & 255))
 
 
 def esf_meas(tag_ms: int, data: Sequence[tuple[int, int]]) -> bytes:
-    """ESF-MEAS of data types and their values (24 bits each, signed), with the time that repeats the tag."""
+    """ESF-MEAS of (data type, signed 24-bit value), with a time tag."""
     words = [kind << 24 | value & 0xFFFFFF for kind, value in data]
     tag = tag_ms % 2**32
     return frame(0x10, 0x02, pack(f"<IHH{len(words) + 1}I", tag, len(words) << 11 | 1 << 3, 0, *words, tag))
 
 
 class UbxWriter:
-    """Writes what one receiver sends; counts its wheels, whose counters count up in reverse too."""
+    """Frames of one receiver; its wheel counters count up in reverse too."""
 
     def __init__(self) -> None:
         self._before: tuple[int, int] | None = None
         self._counters = [0, 0]
 
     def epoch(self, epoch: Epoch) -> bytes:
-        """NAV-PVT, and NAV-RELPOSNED where there is a baseline."""
+        """NAV-PVT, and NAV-RELPOSNED if there is a baseline."""
         return nav_pvt(epoch).frame() + _relposned(epoch)
 
     def imu(self, reading: Imu) -> bytes:
@@ -94,7 +94,7 @@ class UbxWriter:
         return esf_meas(reading.stamp_ns // 10**6, list(zip(GYROS + FORCES, values, strict=True)))
 
     def wheels(self, reading: Encoder) -> bytes:
-        """Both wheels of the rear axle."""
+        """Both rear wheels."""
         ticks = math.floor(reading.left_ticks), math.floor(reading.right_ticks)
         words = []
         for i, (now, before) in enumerate(zip(ticks, self._before or ticks, strict=True)):
@@ -105,7 +105,7 @@ class UbxWriter:
 
 
 def nav_pvt(epoch: Epoch) -> NavPvt:
-    """Time, and place and velocity where there is a fix."""
+    """Time; place and velocity if there is a fix."""
     time, fix, motion = epoch.time, epoch.fix, epoch.motion
     date = (time.year, time.month, time.day, time.hour, time.minute, time.second, VALID)
     timed = NavPvt(_itow_ms(epoch.utc_ns), *date, nano=epoch.utc_ns % 10**9)

@@ -1,1 +1,1 @@
-"""Scenarios: their files, their tables, and the ground that they describe."""
+"""Scenarios: files, tables, and their ground."""

@@ -1,4 +1,4 @@
-"""Scenario files: reading one with its base, and refusing in one line whatever does not fit together."""
+"""Scenario files: read with their base; inconsistencies are refused in one line."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from sim.sensors.presets import parse_preset
 from sim.sensors.rigs import machine_config
 
 FOLDER = Path(__file__).parent
-MARGIN_M = 3.0  # that a route keeps from the edges of the map
-STEERING_SHARE = 0.9  # of a machine's steering that a route may need: the rest is for corrections
+MARGIN_M = 3.0  # from a route to the edges of the map
+STEERING_SHARE = 0.9  # of a machine's steering that a route may need; the rest is for corrections
 MAX_GAP_M, MAX_BEND_DEG = 0.5, 10.0  # between the end of a leg and the start of the next
 
 
 def load_scenario(name: str) -> Scenario:
-    """Read a scenario: a name of the library, or the path of a TOML file. A ConfigError names the place of a fault."""
+    """Read a scenario by library name or TOML path; ConfigError names the place of a fault."""
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not name.endswith(".toml") and not path.is_file():
         known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.toml")))
@@ -43,7 +43,7 @@ def load_scenario(name: str) -> Scenario:
 
 
 def check(scenario: Scenario, where: str) -> None:
-    """Refuse what does not fit together: a ConfigError names the place."""
+    """Refuse inconsistencies with a ConfigError that names the place."""
     routes = {route.name: route.build() for route in scenario.route}
     margin_m = MARGIN_M + scenario.driving.widest_m
     for name, route in routes.items():
@@ -90,7 +90,7 @@ def _check_curvature(leg: Leg, model: MachineModel, route: str) -> None:
 
 
 def _check_joints(route: Route, place: str) -> None:
-    """The legs of a cycle must meet, and a machine keeps its heading where they do."""
+    """Legs of a cycle must meet, with the machine's heading unchanged."""
     if route.legs[0].closed:
         return
     for i, leg in enumerate(route.legs):

@@ -1,4 +1,4 @@
-"""The ground of a site as a scenario describes it: zones of soil, ramps and roughness; and the terrain made of it."""
+"""The ground of a scenario: soil zones, ramps, roughness; and the terrain from it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from protocol.arrays import Bools, Floats, Ints
 from protocol.config import require_between
 from sim.terrain.terrain import SOILS, Terrain
 
-FILLET_M = 2.0  # length over which the foot and the crown of a ramp are rounded
+FILLET_M = 2.0  # rounding length at a ramp's foot and crown
 ROUGHNESS_LENGTH_M = 1.2
-ROUGHNESS_STREAM = 2**32 - 1  # keeps the ground's noise apart from the machines', which are numbered from 0
+ROUGHNESS_STREAM = 2**32 - 1  # apart from machines, numbered from 0
 MAX_NODES = 20_000_000
 
 Point = tuple[float, float]
@@ -21,7 +21,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class ZoneConfig:
-    """A polygon of one soil. outline: corners in `map` [m]."""
+    """Polygon of one soil. outline: corners in `map` [m]."""
 
     soil: str
     outline: tuple[Point, ...]
@@ -34,7 +34,7 @@ class ZoneConfig:
 
 @dataclass(frozen=True)
 class RampConfig:
-    """A plane slope from its foot to its top, as wide as the site; beyond both the ground is level."""
+    """Plane slope from foot to top, as wide as the site, level beyond."""
 
     foot_m: Point
     top_m: Point
@@ -55,9 +55,9 @@ class RampConfig:
 
 @dataclass(frozen=True)
 class GroundConfig:
-    """A rectangle from the origin of `map` to the north-east. soil: wherever no zone lies; later zones cover earlier.
+    """Rectangle north-east of the origin of `map`. soil: outside zones; later zones cover earlier ones.
 
-    cell_m: of the terrain's height and zones. roughness_m: standard deviation of the unevenness.
+    cell_m: of heights and zones. roughness_m: standard deviation.
     """
 
     width_m: float
@@ -77,13 +77,13 @@ class GroundConfig:
             raise ValueError(f"cell_m: {self.cell_m:g} m is too fine for so large a site, over {MAX_NODES} nodes")
 
     def contains(self, points_m: Floats, margin_m: float) -> Bools:
-        """Whether points (k, 2) lie on the site, this far from its edges, (k,)."""
+        """Whether points (k, 2) are on the site, margin_m from its edges, (k,)."""
         inside = (points_m >= margin_m) & (points_m <= np.array([self.width_m, self.depth_m]) - margin_m)
         return np.logical_and(inside[:, 0], inside[:, 1])
 
 
 def soil_index(name: str) -> int:
-    """Index of a soil in `soil.SOILS`; a ValueError names the known ones."""
+    """Index into `soil.SOILS`; ValueError with the known names."""
     names = [soil.name for soil in SOILS]
     if name not in names:
         raise ValueError(f"soil: {name!r} is none of {', '.join(names)}")
@@ -91,7 +91,7 @@ def soil_index(name: str) -> int:
 
 
 def build_terrain(ground: GroundConfig, seed: int) -> Terrain:
-    """Make the terrain; its unevenness is drawn from the seed."""
+    """Build the terrain; roughness is drawn from the seed."""
     rows, columns = round(ground.depth_m / ground.cell_m), round(ground.width_m / ground.cell_m)
     heights = _profile(ground, rows, columns)
     if ground.roughness_m:
@@ -104,7 +104,7 @@ def build_terrain(ground: GroundConfig, seed: int) -> Terrain:
 
 
 def with_zone(terrain: Terrain, zone: ZoneConfig) -> Terrain:
-    """The same terrain with one zone laid over it."""
+    """The terrain with one more zone on top."""
     zones = terrain.zones.astype(np.uint8)
     corners = np.round(np.array(zone.outline) / terrain.zone_cell_m).astype(np.int32)
     cv2.fillPoly(zones, [corners], soil_index(zone.soil))
@@ -120,7 +120,7 @@ def _profile(ground: GroundConfig, rows: int, columns: int) -> Floats:
         length = float(np.hypot(*ramp.run_m))
         east, north = ramp.run_m / length
         along = (x - ramp.foot_m[0]) * east + (y - ramp.foot_m[1]) * north
-        # a running mean of the clipped distance, by its antiderivative
+        # running mean of the clipped distance, by its antiderivative
         ahead, behind = (_area(along + side * FILLET_M / 2, length) for side in (1, -1))
         heights += ramp.rise_m / length * (ahead - behind) / FILLET_M
     return heights

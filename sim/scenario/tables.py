@@ -1,4 +1,4 @@
-"""Scenarios: the tables of a TOML file that describe what is simulated."""
+"""Tables of a scenario's TOML file."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from sim.sensors.rigs import Faults, Rig, machine_config
 
 WORLDS = ("pybullet", "fast")
 MAX_MACHINES = 1000
-GOLDEN = 0.618  # the golden section spreads any number of machines over a route
+GOLDEN = 0.618  # spreads any number of machines over a route
 
 
 @dataclass(frozen=True)
 class LegConfig:
-    """One leg of a work cycle: corners of its line [m], backwards or not, and what happens at its end."""
+    """One leg of a work cycle: corners [m], direction, and the event at its end."""
 
     corners: tuple[Point, ...]
     reverse: bool = False
@@ -40,7 +40,7 @@ class LegConfig:
 
 @dataclass(frozen=True)
 class RouteConfig:
-    """A route: `corners` of a closed tour, or `leg`s end to end that are driven again and again."""
+    """Route: `corners` of a closed tour, or a repeated chain of `leg`s."""
 
     name: str
     corners: tuple[Point, ...] = ()
@@ -62,12 +62,11 @@ class RouteConfig:
 
 @dataclass(frozen=True)
 class FleetConfig:
-    """Machines of one kind. name: of a single one; counted ones are numbered, name-1, name-2, ...
+    """Machines of one kind. name: of a single machine; with count: name-1, name-2, ...
 
-    routes: taken in turn; other_way: every second round of turns is driven in the opposite direction. start: share of
-    the cycle at which the first begins. gps, imu, attitude: numbers of the sensors, as the machine's URDF has them.
-    payload: whether they weigh what they carry; None: if it changes on a route of theirs. doppler: whether their
-    receivers state velocities. can: whether their drive trains speak J1939, in place of sensors at the wheels.
+    routes: assigned in turn; other_way: every second round in the opposite direction. start: share of the cycle where
+    the first begins. gps, imu, attitude: sensor numbers in the URDF. payload: whether it is weighed; None: if a route
+    changes it. doppler: whether receivers state velocities. can: J1939 drive train in place of wheel sensors.
     """
 
     name: str
@@ -96,25 +95,25 @@ class FleetConfig:
 
     @property
     def size(self) -> int:
-        """How many machines they are."""
+        """Number of machines."""
         return 1 if self.count is None else self.count
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Name of each machine."""
+        """Names of the machines."""
         return (self.name,) if self.count is None else tuple(f"{self.name}-{i + 1}" for i in range(self.count))
 
 
 @dataclass(frozen=True)
 class FaultConfig(Faults):
-    """The faults of one machine."""
+    """Faults of one machine."""
 
     machine: str = ""
 
 
 @dataclass(frozen=True)
 class ScheduledChange:
-    """Ground that becomes another soil while machines drive. at_s: simulated seconds after the start."""
+    """Ground that becomes another soil. at_s: simulated seconds after the start."""
 
     at_s: float
     soil: str
@@ -127,13 +126,13 @@ class ScheduledChange:
 
     @property
     def zone(self) -> ZoneConfig:
-        """The ground that it becomes."""
+        """The new ground."""
         return ZoneConfig(self.soil, self.outline)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """What is simulated. world: pybullet, or fast. give_way: drivers wait for machines ahead; driving: their habits."""
+    """A simulation. world: pybullet, or fast. give_way: drivers wait for machines ahead. driving: their habits."""
 
     description: str
     site: SiteConfig
@@ -165,11 +164,11 @@ class Scenario:
 
     @property
     def machine_names(self) -> tuple[str, ...]:
-        """Name of every machine."""
+        """Names of all machines."""
         return self.names or tuple(name for fleet in self.fleet for name in fleet.names)
 
     def preset(self, name: str) -> Preset:
-        """A preset of this scenario or of the library."""
+        """Preset of this scenario or of the library."""
         return self.presets[name] if name in self.presets else load_preset(name)
 
     def rigs(self) -> list[Rig]:
@@ -190,7 +189,7 @@ class Scenario:
         return rigs
 
     def journeys(self) -> list[tuple[Route, float, float]]:
-        """Route, speed [m/s] and share of the cycle to start at, of every machine."""
+        """Route, speed [m/s] and starting share of the cycle per machine."""
         built = {route.name: route.build() for route in self.route}
         journeys = []
         for fleet in self.fleet:
@@ -203,7 +202,6 @@ class Scenario:
         return journeys
 
     def _loads(self, fleet: FleetConfig) -> bool:
-        """Whether a route of this fleet changes what machines carry."""
         legs = itertools.chain.from_iterable(route.leg for route in self.route if route.name in fleet.routes)
         return any(leg.payload_kg is not None for leg in legs)
 

@@ -1,1 +1,1 @@
-"""Sensor models: readings of a true state with their errors, and the sensors of each machine."""
+"""Sensor models with their errors, and the sensors of each machine."""

@@ -1,4 +1,4 @@
-"""GPS receivers: slow and white errors of fixes, Doppler velocities, outages, antennas on their lever arms."""
+"""GPS receivers: slow and white errors, Doppler velocities, outages, antennas on lever arms."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sim.sensors.presets import BASE_RATE_HZ, GpsNoise
 from sim.sensors.sensor_group import SensorGroup, SensorUnit
 from sim.state import STEP_S, FleetState
 
-AXES = np.array([1.0, 1.0, 5 / 3])  # heights are this much worse
-LEAST_M2 = 1e-4  # no receiver states a smaller variance,
-LEAST_M2PS2 = 1e-6  # nor one of a velocity
+AXES = np.array([1.0, 1.0, 5 / 3])  # heights are 5/3 worse
+LEAST_M2 = 1e-4  # smallest variance that a receiver states
+LEAST_M2PS2 = 1e-6  # same, of a velocity
 
 
 class AntennaGroup(SensorGroup):
-    """What receivers make of antennas; nothing for outage_s of every outage_period_s."""
+    """Receivers of antennas; silent for outage_s of every outage_period_s."""
 
     def __init__(self, units: Sequence[SensorUnit], seed: int) -> None:
         super().__init__(units)
@@ -30,7 +30,7 @@ class AntennaGroup(SensorGroup):
         self._phase_s = self._period_s * self.per_unit(lambda unit: _phase(unit, seed))
 
     def valid(self, steps: Ints) -> Bools:
-        """False while a receiver is lost."""
+        """False during an outage."""
         time_s = steps[:, None] * STEP_S + self._phase_s
         valid: Bools = time_s % self._period_s >= self._outage_s - 1e-9
         return valid
@@ -41,7 +41,7 @@ class AntennaGroup(SensorGroup):
 
 
 class VelocityGroup(AntennaGroup):
-    """Velocities of antennas by Doppler shift: white errors. Machines go where they head: there is no side slip."""
+    """Doppler velocities of antennas with white errors; no side slip."""
 
     def __init__(self, units: Sequence[SensorUnit], seed: int) -> None:
         super().__init__(units, seed)
@@ -59,7 +59,7 @@ class VelocityGroup(AntennaGroup):
 
 
 class GpsGroup(AntennaGroup):
-    """Fixes of receivers. They state their total variances; errors run on while they are silent."""
+    """Fixes with stated total variances; errors continue during outages."""
 
     def __init__(self, units: Sequence[SensorUnit], seed: int, projection: Projection) -> None:
         super().__init__(units, seed)
@@ -69,7 +69,7 @@ class GpsGroup(AntennaGroup):
         self._off_m = self.per_unit(lambda unit: unit.rig.faults.antenna_off_m)[:, None]
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
-        """Latitude, longitude, height and the stated variances."""
+        """Latitude, longitude, height, stated variances."""
         lever = self._lever_m + self._off_m * self.faulty(steps)
         base = np.stack([self.pick(place, rows) for place in (states.x_m, states.y_m, states.z_m)])
         slow, white = self._errors.run(steps)
@@ -79,10 +79,9 @@ class GpsGroup(AntennaGroup):
 
 
 class ReceiverErrors:
-    """Errors of receivers east, north and up: slow ones of the site, the machine and the receiver, and white noise.
+    """Errors east, north and up: slow ones of site, machine and receiver, and white noise.
 
-    noises: of each receiver, all of one rate. machines: which machine carries it. rngs: a generator each. stated_m2:
-    the variances (3, units) that they state.
+    noises, rngs: per receiver, of one rate. machines: their carriers. stated_m2: stated variances (3, units).
     """
 
     def __init__(
@@ -108,7 +107,7 @@ class ReceiverErrors:
         ]
 
     def run(self, steps: Ints) -> tuple[Floats, Floats]:
-        """Slow and white errors, (3, r, units) each [m], at the next steps (r,) at which these receivers read."""
+        """Slow and white errors, (3, r, units) each [m], at the next reading steps (r,)."""
         draws = self._draws.next_rows(len(steps))
         slow = self._own.run(draws[:3])
         for std_m, drift in self._common:
@@ -117,10 +116,10 @@ class ReceiverErrors:
 
 
 class CommonDrift:
-    """Drifts that several receivers have in common, (3, r, units) of variance 1; the same for equal correlation times.
+    """Drift shared by several receivers, (3, r, units), variance 1; equal for equal correlation times.
 
-    rngs: of each source, the site or a machine. source: that of each receiver (units,). They run at every step of the
-    world, whatever the receivers' rates; all correlation times of one source answer to the same white noise.
+    rngs: per source, the site or a machine. source: of each receiver (units,). It advances every world step, whatever
+    the receivers' rates. All correlation times of a source use the same white noise.
     """
 
     def __init__(self, rngs: Sequence[np.random.Generator], source: Ints, time_s: Floats) -> None:
@@ -132,7 +131,7 @@ class CommonDrift:
         self._step = 0
 
     def run(self, steps: Ints) -> Floats:
-        """Run on to the last of these steps; returns the drift after each."""
+        """Advance to the last step; returns the drift after each."""
         drift = self._drift.run(self._draws.next_rows(int(steps[-1]) - self._step)[:, :, self._source_of])
         rows = steps - self._step - 1
         self._step = int(steps[-1])
@@ -141,7 +140,7 @@ class CommonDrift:
 
 
 def _phase(unit: SensorUnit, seed: int) -> float:
-    """Where in its outage period a receiver starts, 0..1: in turn on one machine, machines independently."""
+    """Phase in the outage period, 0..1: staggered on one machine, independent between machines."""
     receivers = [sensor for sensor in unit.rig.machine.sensors if sensor.kind == unit.sensor.kind]
     turn = receivers.index(unit.sensor) / len(receivers)
     return float(generator(seed, unit.machine, "outage").uniform()) + turn

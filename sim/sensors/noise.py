@@ -1,7 +1,7 @@
-"""Random errors of many sensors at once: one generator per machine and sensor, and slow Gauss-Markov errors.
+"""Random errors of many sensors: one generator per machine and sensor; Gauss-Markov errors.
 
-Each sensor draws row by row, one row per reading, so that its readings depend neither on how many are made at a time
-nor on which other sensors there are. Arrays hold axes first, then readings, then sensors: (axes, r, units).
+Every sensor draws one row per reading, so its readings depend neither on batch size nor on other sensors. Arrays are
+(axes, readings, sensors), written (axes, r, units).
 """
 
 from __future__ import annotations
@@ -12,37 +12,37 @@ import numpy as np
 
 from protocol.arrays import Floats
 
-# The order fixes which generator a sensor gets: append only, or all seeds change their meaning.
+# The order determines each sensor's generator: append only, or all seeds change their meaning.
 STREAMS: tuple[str, ...] = ("body", "gps-1", "gps-2", "gps-3", "imu-1", "imu-2", "imu-3", "wheels", "torque")
 STREAMS += ("articulation", "outage", "imu-4", "attitude-1", "attitude-2", "attitude-3", "attitude-4", "payload")
-STREAMS += ("receivers", "driver")  # what the receivers of one machine have in common; its driver
-STREAMS += ("vibration",)  # of one machine: all its IMUs shake alike
+STREAMS += ("receivers", "driver")  # shared by a machine's receivers; its driver
+STREAMS += ("vibration",)  # shared by a machine's IMUs
 STREAMS += ("brake", "doppler-1", "doppler-2", "doppler-3")
-STREAMS += ("pump", "fuel")  # of a machine whose bus speaks
-SITE = 2**32 - 1  # in the place of a machine's number: what all machines of a site share
-# Drawn at a time: a call for every reading would cost more than its numbers. No power of two, or the rows that all
-# sensors take together would share a few lines of the cache (six times slower).
+STREAMS += ("pump", "fuel")  # of a machine with CAN
+SITE = 2**32 - 1  # in place of a machine's number: shared by the whole site
+# Drawn at a time, because a call costs more than a row. No power of two: rows of all sensors would share a few cache
+# lines (six times slower).
 BLOCK_ROWS = 250
 
 
 def generator(seed: int, machine: int, stream: str) -> np.random.Generator:
-    """The generator of one sensor of a machine; the same whatever other machines and sensors there are."""
-    # the key is what SeedSequence.spawn() would give the sensor's child, without spawning the others
+    """Generator of one sensor, independent of other machines and sensors."""
+    # the key that SeedSequence.spawn() would give
     return _generator(seed, machine, STREAMS.index(stream))
 
 
 def site_generator(seed: int) -> np.random.Generator:
-    """The generator of what all machines share."""
+    """Generator of what all machines share."""
     return _generator(seed, SITE)
 
 
 def _generator(seed: int, *key: int) -> np.random.Generator:
-    # SFC64: a quarter faster than numpy's default, and most of the time of a large fleet's sensors goes into draws
+    # SFC64 is a quarter faster than numpy's default; draws dominate the sensor time of large fleets.
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)))
 
 
 class Draws:
-    """Unit normal numbers, `width` for each reading of each sensor; every sensor has its own generator."""
+    """Unit normals, `width` per reading, one generator per sensor."""
 
     def __init__(self, rngs: Sequence[np.random.Generator], width: int) -> None:
         self._rngs = rngs
@@ -69,10 +69,10 @@ class Draws:
 
 
 class GaussMarkov:
-    """Exponentially correlated errors of `sigma` (axes, units); time_s: (units,). `start`: unit normals (axes, units).
+    """Exponentially correlated errors, `sigma` (axes, units), time_s (units,). `start`: unit normals (axes, units).
 
-    They start in their stationary distribution. Exact discretisation of b' = -b/tau + w: b+ = a b + sigma
-    sqrt(1 - a^2) w with a = exp(-dt/tau) (Gazebo's plugin has dt where sqrt(dt) belongs).
+    Stationary from the start. Exact discretisation of b' = -b/tau + w: b+ = a b + sigma sqrt(1 - a^2) w with a =
+    exp(-dt/tau) (Gazebo's plugin has dt for sqrt(dt)).
     """
 
     def __init__(self, sigma: Floats, time_s: Floats, dt: float, start: Floats) -> None:
@@ -81,10 +81,10 @@ class GaussMarkov:
         self._error: Floats = sigma * start
 
     def run(self, white: Floats) -> Floats:
-        """Advance by one step per row of unit white noise (axes, r, units); returns the error after each."""
+        """Advance one step per row of unit white noise (axes, r, units); returns the error after each."""
         errors: Floats = white * self._kick
         for row in range(errors.shape[1]):
             errors[:, row] += self._keep * self._error
             self._error = errors[:, row]
-        self._error = self._error.copy()  # so that it does not keep all the others alive
+        self._error = self._error.copy()  # does not keep the other rows alive
         return errors

@@ -1,6 +1,6 @@
-"""Presets: errors of all sensor models and how often they read, in named sets like those of real sensors.
+"""Presets: named sets of sensor errors and rates, like those of real sensors.
 
-Standard deviations are of one reading unless they say otherwise; `presets.toml`, the library, holds values and sources.
+Standard deviations are per reading unless stated. Values and sources: `presets.toml`, the library.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from protocol.files import load_toml
 from protocol.site.site_config import NAME
 
 LIBRARY = Path(__file__).parent / "presets.toml"
-BASE_RATE_HZ = 100  # of the world; sensors read at every so many of its steps
+BASE_RATE_HZ = 100  # of the world; sensor rates divide it
 
-SAME_NOISE = {"brake_force": "brake", "gps_velocity": "gps"}  # kinds whose errors stand in the table of another
-BRAKE_READINGS = {"nothing": "", "switch": "brake", "share": "brake", "force": "brake_force"}  # and their kinds
+SAME_NOISE = {"brake_force": "brake", "gps_velocity": "gps"}  # kinds whose errors stand in another table
+BRAKE_READINGS = {"nothing": "", "switch": "brake", "share": "brake", "force": "brake_force"}  # reads -> kind
 
-# What values may be, lowest and highest.
+# Limits of values.
 NotNegative = Annotated[float, (0.0, 1e6)]
 Positive = Annotated[float, (0.01, 1e6)]
 Share = Annotated[float, (0, 1)]
@@ -33,7 +33,7 @@ Heading = Annotated[float, (0, 180)]
 
 @dataclass(frozen=True)
 class Ranged:
-    """Values that lie in the ranges of their types."""
+    """Values within the limits of their types."""
 
     def __post_init__(self) -> None:
         for name, hint in get_type_hints(type(self), include_extras=True).items():
@@ -43,7 +43,7 @@ class Ranged:
 
 @dataclass(frozen=True)
 class SensorErrors(Ranged):
-    """Errors of one kind of sensor, and how often it reads."""
+    """Errors and rate of one kind of sensor."""
 
     rate_hz: int
 
@@ -55,11 +55,11 @@ class SensorErrors(Ranged):
 
 @dataclass(frozen=True)
 class GpsNoise(SensorErrors):
-    """A receiver: slow Gauss-Markov drift and white noise per horizontal axis; heights are 5/3 worse.
+    """Receiver: Gauss-Markov drift and white noise per horizontal axis; heights are 5/3 worse.
 
-    scale: multiplies drift and white noise alike. machine_share: share of the drift's variance that the receivers of
-    one machine have in common; site_share: the part of it that all receivers of the site have in common. The receiver
-    is silent for outage_s of every outage_period_s. velocity_std_mps: of its Doppler velocity, white, per axis.
+    scale: factor on both. machine_share: share of the drift's variance common to one machine's receivers; site_share:
+    the part of it common to the site. Silent for outage_s of every outage_period_s. velocity_std_mps: Doppler, white,
+    per axis.
     """
 
     drift_std_m: NotNegative
@@ -82,11 +82,11 @@ class GpsNoise(SensorErrors):
 
 @dataclass(frozen=True)
 class ImuNoise(SensorErrors):
-    """An IMU, per axis: white noise, a zero that is drawn at turn-on, slow drift of it, scale (of 1), mounting.
+    """IMU, per axis: white noise, turn-on bias, bias drift, scale error (of 1), mounting.
 
-    force_vibration_mps2: added to the white noise of the force while driving, in full from vibration_speed_mps on.
-    shake_mps2, wheel_mps2, engine_mps2: standard deviations of how the body itself shakes, per axis: broad-band, with
-    the lugs of the wheels, and with the engine (`vibration`). degps_per_mps2: the rates that go with them.
+    force_vibration_mps2: added to the force's white noise while driving, in full from vibration_speed_mps. shake_mps2,
+    wheel_mps2, engine_mps2: standard deviations of body vibration per axis: broad-band, wheel lugs, engine
+    (`vibration`). degps_per_mps2: its angular rates.
     """
 
     gyro_white_degps: NotNegative
@@ -108,9 +108,9 @@ class ImuNoise(SensorErrors):
 
 @dataclass(frozen=True)
 class AttitudeNoise(SensorErrors):
-    """An attitude and heading reference: slow and white errors of roll, pitch and heading.
+    """Attitude and heading reference: slow and white errors.
 
-    heading_offset_deg: constant part of the heading's error, drawn once.
+    heading_offset_deg: constant heading error, drawn once.
     """
 
     tilt_drift_deg: Tilt
@@ -123,16 +123,16 @@ class AttitudeNoise(SensorErrors):
 
 @dataclass(frozen=True)
 class EncoderNoise(SensorErrors):
-    """Wheel encoders: whole ticks. Slip and the wheels' true radius are errors of the wheels, not of these."""
+    """Wheel encoders: whole ticks. Slip and true wheel radius are errors of the wheels."""
 
     ticks_per_rev: Annotated[int, (1, 1_000_000)]
 
 
 @dataclass(frozen=True)
 class TorqueNoise(SensorErrors):
-    """Drive torque: white noise, noise correlated over correlation_s, and an error of the scale (of 1) drawn once.
+    """Drive torque: white noise, correlated noise, scale error (of 1) drawn once.
 
-    sees_brakes: whether what brakes the machine is in it; else service brakes do it, beside the drive train.
+    sees_brakes: whether braking is part of it; else service brakes act beside the drive train.
     """
 
     white_nm: NotNegative
@@ -144,7 +144,7 @@ class TorqueNoise(SensorErrors):
 
 @dataclass(frozen=True)
 class BrakeNoise(SensorErrors):
-    """Brakes. reads: `nothing` of them, a `switch`, the `share` of their most, or their `force` with white noise."""
+    """Brakes. reads: `nothing`, a `switch`, the `share` of the maximum, or the `force` with white noise."""
 
     reads: str
     white_n: NotNegative
@@ -157,7 +157,7 @@ class BrakeNoise(SensorErrors):
 
 @dataclass(frozen=True)
 class ArticulationNoise(SensorErrors):
-    """Angle of the joint: white noise, and a zero that is drawn once."""
+    """Joint angle: white noise, bias drawn once."""
 
     white_deg: Tilt
     zero_deg: Tilt
@@ -165,7 +165,7 @@ class ArticulationNoise(SensorErrors):
 
 @dataclass(frozen=True)
 class PayloadNoise(SensorErrors):
-    """A weighing system: white noise, and an error of the scale (of 1) drawn once."""
+    """Weighing system: white noise, scale error (of 1) drawn once."""
 
     white_kg: NotNegative
     scale: Scale
@@ -173,7 +173,7 @@ class PayloadNoise(SensorErrors):
 
 @dataclass(frozen=True)
 class BodySpread(Ranged):
-    """How bodies differ from their nominal: mass, evenly up to this share; wheel radius, standard deviation (of 1)."""
+    """Body tolerances: mass, uniform; wheel radius, standard deviation (of 1)."""
 
     mass: Scale
     wheel_radius: Annotated[float, (0, 0.1)]
@@ -181,7 +181,7 @@ class BodySpread(Ranged):
 
 @dataclass(frozen=True)
 class Preset:
-    """Errors of all sensors of a machine, by their kind, and how far its body is from nominal."""
+    """Errors of a machine's sensors by kind, and tolerances of its body."""
 
     name: str
     gps: GpsNoise
@@ -199,23 +199,22 @@ class Preset:
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
 
     def rate_hz(self, kind: str) -> int:
-        """How often sensors of a kind read."""
+        """Rate of a kind of sensor."""
         return int(getattr(self, SAME_NOISE.get(kind, kind)).rate_hz)
 
 
 @cache
 def load_preset(name: str) -> Preset:
-    """Read a preset of the library."""
+    """Load a preset of the library."""
     return parse_preset({"name": name, **_entry(name, "preset")}, f"{LIBRARY} [{name}]")
 
 
 def parse_preset(table: Mapping[str, Any], where: str) -> Preset:
-    """Build a preset from its TOML table. `base` names a preset of the library, of which the table changes values."""
+    """Build a preset from its TOML table; `base` names a library preset whose values it changes."""
     return from_table(Preset, _complete(table, where), where)
 
 
 def _complete(table: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Merge a table over its base, section by section."""
     own = {key: value for key, value in table.items() if key != "base"}
     if "base" not in table:
         return own

@@ -1,4 +1,4 @@
-"""The sensors of each machine: what its agent may know, the errors of its sensors, and its faults."""
+"""A machine's sensors: what its agent may know, their errors, and faults."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sim.machines.model import MachineModel
 from sim.sensors.noise import generator
 from sim.sensors.presets import BRAKE_READINGS, GpsNoise, Preset
 
-# What a machine's bus carries: the sensor of each stream of `agents.drivers.can`, or of a signal of its maker.
+# Sensors on a machine's bus, by stream of `agents.drivers.can` or maker's signal.
 CAN_SENSORS = {
     "engine": SensorConfig("engine", "engine"),
     "losses": SensorConfig("losses", "engine_losses"),
@@ -30,11 +30,10 @@ CAN_SENSORS = {
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults of a machine from from_s (simulated) on, beyond the errors of its preset.
+    """Faults from simulated time from_s on, beyond the preset's errors.
 
-    torque_scale: factor on what the drive train reports. antenna_off_m: how far the antennas really sit from where the
-    config says, in `base_link`. clock_off_s: what the stamps of all its sensors are ahead. rolling: factor on the
-    rolling resistance of its tyres, which are soft or hard from the start.
+    torque_scale: factor on reported torque. antenna_off_m: true minus configured antenna position, in `base_link`.
+    clock_off_s: how far all stamps are ahead. rolling: factor on the tyres' rolling resistance, from the start.
     """
 
     from_s: float = 0.0
@@ -54,9 +53,9 @@ class Faults:
 
 @dataclass(frozen=True)
 class Rig:
-    """One machine's sensors. machine: what its agent may know; the rest is for the simulator alone.
+    """One machine's sensors. machine: what its agent may know; the rest is for the simulator.
 
-    can: whether its drive train speaks on a bus (`CAN_SENSORS`), in place of sensors at the wheels.
+    can: drive train on a bus (`CAN_SENSORS`) in place of wheel sensors.
     """
 
     machine: MachineConfig
@@ -67,12 +66,12 @@ class Rig:
 
     @property
     def feeds(self) -> dict[str, SensorConfig]:
-        """The sensor of each stream that its bus carries."""
+        """Sensor per stream on its bus."""
         return {stream: s for stream, s in CAN_SENSORS.items() if self.can and s in self.machine.sensors}
 
     @property
     def off_bus(self) -> tuple[SensorConfig, ...]:
-        """Its sensors that no bus carries."""
+        """Sensors on no bus."""
         on_bus = self.feeds.values()
         return tuple(sensor for sensor in self.machine.sensors if sensor not in on_bus)
 
@@ -89,11 +88,10 @@ def machine_config(
     doppler: bool = False,
     can: bool = False,
 ) -> MachineConfig:
-    """Describe a machine of a kind as its agent knows it; sensors by the numbers that the model's URDF gives them.
+    """Machine as its agent knows it; sensors by their URDF numbers.
 
-    attitude: IMUs that also say their orientation. payload: whether it weighs what it carries. doppler: whether its
-    receivers state velocities. can: whether its bus takes the place of sensors at the wheels. Fast sensors stand first:
-    readings of one stamp then have the same order live, in bundles and in log folders.
+    attitude: IMUs with orientation. payload: weighed. doppler: receivers state velocities. can: a bus replaces wheel
+    sensors. Fast sensors come first, so that readings of one stamp have the same order live, in bundles and in logs.
     """
     ticks = preset.encoder.ticks_per_rev
     sensors = [_inertial("imu", number, model) for number in imu]
@@ -108,7 +106,7 @@ def machine_config(
     sensors += [SensorConfig("brake", kind)] if not can and (kind := BRAKE_READINGS[preset.brake.reads]) else []
     sensors.sort(key=lambda sensor: -preset.rate_hz(sensor.kind))
     sensors += can_sensors(model) if can else []
-    payload_x_m, _, payload_z_m = np.round(model.payload_centre_m, 2).tolist()  # no finer than a data sheet
+    payload_x_m, _, payload_z_m = np.round(model.payload_centre_m, 2).tolist()  # precision of a data sheet
     return MachineConfig(
         name,
         mass_kg=model.mass_kg,
@@ -127,7 +125,7 @@ def machine_config(
 
 
 def can_sensors(model: MachineModel) -> list[SensorConfig]:
-    """Sensors that the bus of a kind of machine feeds."""
+    """Sensors on the bus of a kind of machine."""
     if not model.drive_train:
         raise ValueError(f"can: a {model.name} has no drive train that speaks on a bus")
     has_pump = model.drive_train.hydraulics > 0
@@ -135,7 +133,7 @@ def can_sensors(model: MachineModel) -> list[SensorConfig]:
 
 
 def draw_bodies(rigs: Sequence[Rig], seed: int) -> Bodies:
-    """Draw the true bodies of machines around their nominal ones."""
+    """Draw true bodies around the nominal ones."""
     mass_kg, radius_m = np.empty(len(rigs)), np.empty(len(rigs))
     for i, rig in enumerate(rigs):
         rng, spread = generator(seed, i, "body"), rig.preset.body
@@ -159,9 +157,9 @@ def _receiver(number: int, model: MachineModel, noise: GpsNoise) -> SensorConfig
 
 
 def _slow(noise: GpsNoise) -> tuple[float, float]:
-    """The slow share of a receiver's variance, and its time."""
+    """Slow share of a receiver's variance, and its correlation time."""
     total = math.hypot(noise.drift_std_m, noise.white_std_m)
-    share = round((noise.drift_std_m / total) ** 2, 2) if total else 0.0  # no finer than a data sheet
+    share = round((noise.drift_std_m / total) ** 2, 2) if total else 0.0  # precision of a data sheet
     return share, noise.drift_time_s
 
 

@@ -1,4 +1,4 @@
-"""Sensor groups: all sensors of one kind, rate and frame, of all machines, that are read together as arrays."""
+"""Sensor groups: all sensors of one kind, rate and frame, read together as arrays."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sim.state import STEP_S, FleetState
 
 @dataclass(frozen=True)
 class SensorUnit:
-    """One sensor of one machine, and its generator. machine: its place in the fleet."""
+    """One sensor of one machine. machine: its index in the fleet."""
 
     machine: int
     rig: Rig
@@ -28,10 +28,10 @@ class SensorUnit:
 
 @dataclass(frozen=True)
 class GroupReadings:
-    """Readings of one group as columns: r instants by u sensors.
+    """Readings of one group: r instants by u sensors.
 
-    machines (u,), names: whose reading and of which sensor. values: (r, u, c), the kind's columns in the order of
-    `protocol.machine.readings.columns`. valid: (r, u), false where a sensor is silent.
+    machines (u,), names: of the sensors. values: (r, u, c), in the order of `protocol.machine.readings.columns`. valid:
+    (r, u), false while silent.
     """
 
     kind: str
@@ -42,14 +42,14 @@ class GroupReadings:
     valid: Bools
 
     def readings(self, unit: int) -> list[Reading]:
-        """Readings of one sensor, as objects."""
+        """Readings of one sensor as objects."""
         cls, name, valid = KINDS[self.kind], self.names[unit], self.valid[:, unit].tolist()
         rows = zip(valid, self.stamps_ns[:, unit].tolist(), self.values[:, unit].tolist(), strict=True)
         return [cls(name, stamp, *values) for is_valid, stamp, values in rows if is_valid]
 
 
 class SensorGroup(ABC):
-    """Sensors of one kind, rate and frame. Inside, arrays hold axes first, then readings, then sensors: (c, r, u)."""
+    """Sensors of one kind, rate and frame; inside, arrays are (axes, readings, sensors): (c, r, u)."""
 
     def __init__(self, units: Sequence[SensorUnit]) -> None:
         self.units = units
@@ -64,7 +64,7 @@ class SensorGroup(ABC):
         self._nothing = GroupReadings(kind, self.machines, names, stamps, values, valid)
 
     def sample(self, steps: Ints, stamps_ns: Ints, states: FleetState) -> GroupReadings:
-        """Read states (k, n, ...) after the steps with these numbers (k,), at the steps that are due."""
+        """Read states (k, n, ...) of steps (k,) where due."""
         rows: Ints = np.flatnonzero(steps % self._every == 0)
         if not rows.size:
             return self._nothing
@@ -75,22 +75,22 @@ class SensorGroup(ABC):
 
     @abstractmethod
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
-        """Values (c, r, u) at these rows of the states. steps: their numbers."""
+        """Values (c, r, u) at these rows of the states. steps: of the rows."""
 
     def valid(self, steps: Ints) -> Bools:
-        """Whether the readings are valid, (r, u): a silent sensor has none."""
+        """Whether readings are valid, (r, u)."""
         return np.ones((len(steps), len(self.units)), bool)
 
     def faulty(self, steps: Ints) -> Bools:
-        """Whether the machine's faults have begun, (r, u)."""
+        """Whether the faults have begun, (r, u)."""
         begun: Bools = steps[:, None] * STEP_S >= self._faulty_from_s - 1e-9
         return begun
 
     def pick(self, quantity: Floats, rows: Ints) -> Floats:
-        """A quantity of the states (k, n) or (k, n, c) for these sensors, (r, u) or (c, r, u)."""
+        """State quantity (k, n) or (k, n, c) for these sensors, (r, u) or (c, r, u)."""
         picked = quantity[rows].take(self.machines, axis=1)
         return picked if picked.ndim == 2 else np.ascontiguousarray(picked.transpose(2, 0, 1))
 
     def per_unit(self, value: Callable[[SensorUnit], object]) -> Floats:
-        """A number or array of each sensor as one array, sensors last."""
+        """One value or array per sensor, sensors last."""
         return np.ascontiguousarray(np.moveaxis(np.array([value(unit) for unit in self.units], float), 0, -1))

@@ -1,6 +1,6 @@
-"""All sensors of all machines: true states in, raw readings out, as columns; reading objects only on demand.
+"""All sensors of all machines: states in, readings out as columns, as objects on demand.
 
-Beside GPS: IMUs, attitude and heading references on either frame, wheels, torque, brakes, joint, payload.
+Besides GPS: IMUs, attitude references, wheels, torque, brakes, joint, payload.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ _LEVEL = np.zeros(1)
 
 
 class EncoderGroup(SensorGroup):
-    """Counts the rear wheels' turns; slip and the wheels' true radius are in what it counts."""
+    """Rear wheel encoders; counts include slip and true wheel radius."""
 
     def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
         self._ticks_per_rad = self.per_unit(lambda unit: unit.sensor.ticks_per_rev) / (2 * np.pi)
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:  # noqa: ARG002 - has no noise of its own
-        """Ticks of the left and the right wheel."""
+        """Ticks, left and right."""
         ticks: Floats = np.floor(self.pick(states.wheel_rad, rows) * self._ticks_per_rad)
         return ticks
 
 
 class TorqueGroup(SensorGroup):
-    """Drive torque at the wheels, as the drive train reports it."""
+    """Drive torque at the wheels, as reported."""
 
     def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
@@ -55,7 +55,7 @@ class TorqueGroup(SensorGroup):
         self._draws = Draws([unit.rng for unit in units], 2)
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
-        """Torque of all wheels together."""
+        """Torque of all wheels."""
         draws = self._draws.next_rows(len(steps))
         scale = self._scale * np.where(self.faulty(steps), self._fault, 1.0)
         torque = self.pick(states.torque_nm, rows)
@@ -66,7 +66,7 @@ class TorqueGroup(SensorGroup):
 
 
 class BrakeGroup(SensorGroup):
-    """Brakes of machines whose drive does not brake: a switch, their share of the most, or their force."""
+    """Brakes of machines whose drive does not brake: switch, share of the maximum, or force."""
 
     def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
@@ -78,10 +78,10 @@ class BrakeGroup(SensorGroup):
         self._draws = Draws([unit.rng for unit in units], 1)
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
-        """The force, or how much of the most is applied; a switch closes at a fiftieth of it."""
+        """Force, or share of the maximum; a switch closes at 2 %."""
         torque = self.pick(states.torque_nm, rows)
         force = np.abs(torque) * (torque * self.pick(states.speed_mps, rows) < 0) / self._radius_m
-        noise = self._white_n * self._draws.next_rows(len(steps)) * (force > 0)  # also gives the axis of the values
+        noise = self._white_n * self._draws.next_rows(len(steps)) * (force > 0)  # also adds the axis of values
         if self._reads_force:
             return np.maximum(force + noise, 0.0)
         share = np.minimum(force[None] / self._most_n, 1.0)
@@ -89,7 +89,7 @@ class BrakeGroup(SensorGroup):
 
 
 class ArticulationGroup(SensorGroup):
-    """Angle of the joint."""
+    """Joint angle."""
 
     def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
@@ -106,7 +106,7 @@ class ArticulationGroup(SensorGroup):
 
 
 class PayloadGroup(SensorGroup):
-    """What the machine carries, as its weighing system states it: never less than nothing."""
+    """Payload as weighed, never negative."""
 
     def __init__(self, units: Sequence[SensorUnit]) -> None:
         super().__init__(units)
@@ -115,7 +115,7 @@ class PayloadGroup(SensorGroup):
         self._draws = Draws([unit.rng for unit in units], 1)
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
-        """Weight of the payload."""
+        """Mass."""
         noise = self._white_kg * self._draws.next_rows(len(steps))
         weighed: Floats = np.maximum(self._scale * self.pick(states.payload_kg, rows) + noise, 0.0)
         return weighed
@@ -123,7 +123,7 @@ class PayloadGroup(SensorGroup):
 
 @dataclass(frozen=True)
 class FrameMotion:
-    """How a rigid frame moves, arrays (3, r, u) in its axes: rate, its derivative, specific force at its origin."""
+    """Motion of a rigid frame, arrays (3, r, u) in its axes: rate, its derivative, specific force at the origin."""
 
     rates_radps: Floats
     rates_dot_radps2: Floats
@@ -136,7 +136,7 @@ class FrameMotion:
         return force
 
     def hinged(self, joint_m: Floats, angle_rad: Floats, radps: Floats, radps2: Floats) -> FrameMotion:
-        """Motion of a frame hinged about z at a place on this one; angle of the hinge, its rate and acceleration."""
+        """Motion of a frame hinged about z on this one; hinge angle, rate, acceleration."""
         rates = seen_turned(angle_rad, self.rates_radps)
         rates_dot = seen_turned(angle_rad, self.rates_dot_radps2)
         rates_dot[0] += radps * rates[1]  # the axes turn under the rear frame's rate
@@ -147,7 +147,7 @@ class FrameMotion:
 
 
 class ImuGroup(SensorGroup):
-    """Gyroscopes and accelerometers; three axes of rate, then three of force."""
+    """Gyroscopes and accelerometers; three axes of rate, three of force."""
 
     def __init__(self, units: Sequence[SensorUnit], seed: int) -> None:
         super().__init__(units)
@@ -197,7 +197,6 @@ class ImuGroup(SensorGroup):
         return values
 
     def _motion(self, rows: Ints, states: FleetState) -> FrameMotion:
-        """Motion of the frames that carry the sensors."""
         rates = (states.rates_radps, states.rates_dot_radps2)
         rear = FrameMotion(*(self.pick(quantity, rows) for quantity in (*rates, states.force_mps2)))
         if not self._on_front:
@@ -207,9 +206,9 @@ class ImuGroup(SensorGroup):
 
 
 class AttitudeGroup(SensorGroup):
-    """Attitude and heading references: quaternion `map_from_sensor` and the variances that they state.
+    """Attitude and heading references: quaternion `map_from_sensor`, stated variances.
 
-    Errors of roll and pitch turn about the sensor's own x and y, the error of the heading about the vertical.
+    Errors of roll and pitch turn about the sensor's x and y, heading errors about the vertical.
     """
 
     def __init__(self, units: Sequence[SensorUnit]) -> None:
@@ -219,7 +218,7 @@ class AttitudeGroup(SensorGroup):
         self._white = np.radians([(n.tilt_white_deg, n.tilt_white_deg, n.heading_white_deg) for n in noises]).T
         offset = np.radians([(0.0, 0.0, n.heading_offset_deg) for n in noises]).T
         self._variances = np.maximum(drift**2 + self._white**2 + offset**2, 1e-10)[:, None]
-        start = self.per_unit(lambda unit: unit.rng.standard_normal(6))  # offset (the heading's alone is used), drift
+        start = self.per_unit(lambda unit: unit.rng.standard_normal(6))  # offset (only the heading's is used), drift
         self._offset = (offset * start[:3])[:, None]
         time_s = np.array([noise.drift_time_s for noise in noises])
         self._drift = GaussMarkov(drift, time_s, 1 / noises[0].rate_hz, start[3:])
@@ -229,7 +228,7 @@ class AttitudeGroup(SensorGroup):
         self._on_front = units[0].sensor.frame == FRONT
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
-        """Quaternion x, y, z, w, and the variances of roll, pitch and yaw."""
+        """Quaternion x, y, z, w; variances of roll, pitch, yaw."""
         draws = self._draws.next_rows(len(steps))
         roll, pitch, heading = self._drift.run(draws[:3]) + self._white[:, None] * draws[3:] + self._offset
         yaw = self.pick(states.yaw_rad, rows) + heading
@@ -253,7 +252,7 @@ _GROUPS: dict[str, type[SensorGroup]] = {
 
 
 def _group(kind: str, units: Sequence[SensorUnit], seed: int, projection: Projection) -> SensorGroup:
-    """Sensors of one kind; the seed is for what those of one machine or site have in common."""
+    """Sensors of one kind; the seed is for errors they share."""
     if kind in ("gps", "gps_velocity"):
         return GpsGroup(units, seed, projection) if kind == "gps" else VelocityGroup(units, seed)
     return ImuGroup(units, seed) if kind == "imu" else _GROUPS[kind](units)
@@ -261,13 +260,13 @@ def _group(kind: str, units: Sequence[SensorUnit], seed: int, projection: Projec
 
 @dataclass(frozen=True)
 class FleetReadings:
-    """Readings of all sensors over a span of time. places: group and column of each sensor of each machine."""
+    """Readings of all sensors. places: (group, column) per sensor of each machine."""
 
     groups: tuple[GroupReadings, ...]
     places: Sequence[Sequence[tuple[int, int]]]
 
     def readings(self, machine: int) -> list[Reading]:
-        """Readings of one machine in the order of their stamps; of one stamp, in the order of its sensors."""
+        """Readings of one machine by stamp, then in the order of its sensors."""
         own = [reading for group, unit in self.places[machine] for reading in self.groups[group].readings(unit)]
         own.sort(key=lambda reading: reading.stamp_ns)
         return own
@@ -276,8 +275,8 @@ class FleetReadings:
 class Sensors:
     """The sensors of a fleet.
 
-    Readings of one sensor depend on the seed, its machine's place in the fleet and its name alone: not on other
-    machines and sensors, nor on how many steps are sampled at a time.
+    A sensor's readings depend on seed, machine index and sensor name alone, neither on other machines and sensors nor
+    on batch size.
     """
 
     def __init__(self, rigs: Sequence[Rig], seed: int, projection: Projection) -> None:
@@ -295,5 +294,5 @@ class Sensors:
         self._groups = [_group(kind, units, seed, projection) for (kind, _, _), units in groups.items()]
 
     def sample(self, steps: Ints, stamps_ns: Ints, states: FleetState) -> FleetReadings:
-        """Read the states (arrays (k, n, ...)) after the steps with these numbers; their order is that of time."""
+        """Read states (arrays (k, n, ...)) after these steps, in time order."""
         return FleetReadings(tuple(group.sample(steps, stamps_ns, states) for group in self._groups), self._places)

@@ -1,9 +1,8 @@
-"""How the bodies of machines shake: broad-band, with the lugs of their wheels, and with their engine.
+"""Vibration of machine bodies: broad-band, from wheel lugs, from the engine.
 
-A body that shakes goes nowhere: its velocity and its angle stay small, so that vibration averages out faster than white
-noise does. On a Clearpath Husky the sideways force has a standard deviation of 0.35 m/s2 over 1/30 s, 0.083 over 1/6 s
-and 0.031 over half a second; white noise would leave 0.16 and 0.09. So the broad-band part is the derivative of
-a Gauss-Markov velocity.
+A vibrating body goes nowhere, so vibration averages out faster than white noise. Sideways force of a Clearpath Husky:
+0.35 m/s2 over 1/30 s, 0.083 over 1/6 s, 0.031 over 0.5 s; white noise would leave 0.16 and 0.09. So the broad-band part
+is the derivative of a Gauss-Markov velocity.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from sim.sensors.noise import Draws, GaussMarkov, generator
 from sim.sensors.presets import ImuNoise
 from sim.state import STEP_S
 
-SHAKE_S = 0.03  # correlation time of the velocity; assumed, the Husky's force falls off from there on
-LUGS = 20  # of a wheel's tread: 17 Hz at 4 m/s on a wheel of 0.75 m; assumed
-ENGINE_HZ = 30.0  # 1800 revolutions a minute; assumed
+SHAKE_S = 0.03  # correlation time of the velocity; assumed: the Husky's force falls off from there
+LUGS = 20  # of a wheel's tread: 17 Hz at 4 m/s, radius 0.75 m; assumed
+ENGINE_HZ = 30.0  # 1800 rev/min; assumed
 
 
 class Vibration:
-    """Rates [rad/s] and forces [m/s2] of shaking bodies, three axes each, in the axes of the frame that shakes.
+    """Vibration rates [rad/s] and forces [m/s2], three axes each, in the vibrating frame.
 
-    noises, machines: of each IMU (units,). Those of one machine shake alike, whatever frame carries them.
+    noises, machines: per IMU (units,). All IMUs of a machine vibrate alike, on either frame.
     """
 
     def __init__(self, noises: Sequence[ImuNoise], machines: Sequence[int], seed: int) -> None:
@@ -36,15 +35,15 @@ class Vibration:
         self._shake, self._wheel, self._engine = (per_mps2 * part for part in parts)
         self._full_mps = np.array([noise.vibration_speed_mps for noise in noises])
         start = np.stack([rng.standard_normal(12) for rng in rngs], axis=-1)
-        self._phases_rad = 2 * np.pi * start[:6, None]  # each axis has its own
+        self._phases_rad = 2 * np.pi * start[:6, None]  # one per axis
         time_s, dt_s = np.full(len(noises), SHAKE_S), 1 / noises[0].rate_hz
         self._moved = GaussMarkov(np.ones((6, len(noises))), time_s, dt_s, start[6:])
         self._last = start[6:, None]
-        self._unit = np.sqrt(2 * (1 - np.exp(-dt_s / SHAKE_S)))  # standard deviation of a step of it
+        self._unit = np.sqrt(2 * (1 - np.exp(-dt_s / SHAKE_S)))  # standard deviation of one step
         self._draws = Draws(rngs, 6)
 
     def run(self, steps: Ints, speed_mps: Floats, wheel_rad: Floats) -> Floats:
-        """The vibration (6, r, units) at the next steps (r,). speed_mps, wheel_rad: (r, units)."""
+        """Vibration (6, r, units) at the next steps (r,). speed_mps, wheel_rad: (r, units)."""
         moved = np.concatenate([self._last, self._moved.run(self._draws.next_rows(len(steps)))], axis=1)
         self._last = moved[:, -1:]
         lugs = np.sin(LUGS * wheel_rad + self._phases_rad)
@@ -56,5 +55,5 @@ class Vibration:
 
 
 def shakes(noise: ImuNoise) -> bool:
-    """Whether an IMU of these errors sits on a body that shakes."""
+    """Whether the IMU's body vibrates."""
     return max(noise.shake_mps2, noise.wheel_mps2, noise.engine_mps2) > 0

@@ -1,1 +1,1 @@
-"""The ground that machines drive on: heights, zones of soil, and what each soil does to wheels."""
+"""The ground: heights, soil zones, and each soil's effect on wheels."""

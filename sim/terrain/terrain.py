@@ -1,6 +1,6 @@
-"""The ground: height on a grid of nodes, bilinear in between, and the soil's zone on a grid of cells (numba).
+"""The ground: bilinear height on a grid, soil zones on cells (numba).
 
-Its five materials are the paper's zones, with a traction and a slip stiffness that are assumed.
+Its five materials are the paper's zones; traction and slip stiffness are assumed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _compiled = numba.njit(cache=True, inline="always", error_model="numpy")
 
 
 class TerrainGrid(NamedTuple):
-    """Arrays of a `Terrain`, for compiled functions."""
+    """Arrays of a `Terrain` for compiled functions."""
 
     heights_m: Floats
     cell_m: float
@@ -29,10 +29,10 @@ class TerrainGrid(NamedTuple):
 
 @dataclass(frozen=True)
 class Terrain:
-    """Ground of a site with its south-west corner at the origin of `map`; beyond the edges, the edge continues.
+    """Ground of a site, south-west corner at the origin of `map`; edge values continue beyond.
 
-    heights_m: (rows, columns) at the nodes, rows to the north, `cell_m` apart. zones: (rows, columns) indices into
-    `soil.SOILS`, one per cell of `zone_cell_m`.
+    heights_m: (rows, columns) at nodes, rows northwards, `cell_m` apart. zones: (rows, columns) indices into
+    `soil.SOILS`, per cell of `zone_cell_m`.
     """
 
     heights_m: Floats
@@ -42,17 +42,17 @@ class Terrain:
 
     @cached_property
     def grid(self) -> TerrainGrid:
-        """The same as a tuple of arrays."""
+        """As a tuple of arrays."""
         heights, zones = np.ascontiguousarray(self.heights_m, float), np.ascontiguousarray(self.zones, np.int64)
         return TerrainGrid(heights, float(self.cell_m), zones, float(self.zone_cell_m))
 
     def surface(self, x_m: Floats, y_m: Floats) -> Floats:
-        """Height [m], bilinear, and its gradient to the east and north [m/m], as (3, ...)."""
+        """Bilinear height [m] and gradient east and north [m/m], as (3, ...)."""
         values: Floats = _surfaces(self.grid, x_m.ravel(), y_m.ravel())
         return values.reshape(3, *x_m.shape)
 
     def height(self, x_m: Floats, y_m: Floats) -> Floats:
-        """Height [m], bilinear."""
+        """Bilinear height [m]."""
         height: Floats = self.surface(x_m, y_m)[0]
         return height
 
@@ -69,7 +69,7 @@ class Terrain:
 
 @_compiled
 def surface(grid: TerrainGrid, x: float, y: float) -> tuple[float, float, float]:
-    """Height, bilinear between the nodes, and its slopes to the east and north; beyond the edges, the edge goes on."""
+    """Bilinear height and slopes east and north; edge values continue beyond."""
     heights, cell = grid.heights_m, grid.cell_m
     rows, columns = heights.shape
     u, v = x / cell, y / cell
@@ -83,7 +83,7 @@ def surface(grid: TerrainGrid, x: float, y: float) -> tuple[float, float, float]
 
 @_compiled
 def zone(grid: TerrainGrid, x: float, y: float) -> int:
-    """Zone of the cell; beyond the edges, the edge goes on."""
+    """Zone of the cell; edge values continue beyond."""
     rows, columns = grid.zones.shape
     row, column = int(y / grid.zone_cell_m), int(x / grid.zone_cell_m)
     index: int = grid.zones[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)]
@@ -101,7 +101,6 @@ def _surfaces(grid: TerrainGrid, x: Floats, y: Floats) -> Floats:
 
 @_compiled
 def _zones(grid: TerrainGrid, x: Floats, y: Floats) -> Ints:
-    """`zone` of places (k,)."""
     indices = np.empty(x.size, np.int64)
     for i in range(x.size):
         indices[i] = zone(grid, x[i], y[i])
@@ -110,7 +109,7 @@ def _zones(grid: TerrainGrid, x: Floats, y: Floats) -> Ints:
 
 @dataclass(frozen=True)
 class Soil:
-    """One material [-]. traction: peak drive force over load. slip_stiffness: that force per unit of slip."""
+    """One material [-]. traction: peak drive force over load. slip_stiffness: force over load per unit of slip."""
 
     name: str
     c_rr: float
@@ -123,7 +122,7 @@ CONCRETE, GRAVEL, DRY_DIRT, WET_DIRT, SAND = range(5)
 _GRIP = ((0.80, 15.0), (0.60, 9.0), (0.60, 7.0), (0.45, 5.0), (0.55, 3.0))
 SOILS = tuple(Soil(zone.name, zone.c_rr, *grip) for zone, grip in zip(ZONES, _GRIP, strict=True))
 
-# Columns of the table above, to be indexed by arrays of zones.
+# Columns of SOILS, indexed by arrays of zones.
 C_RR = np.array([s.c_rr for s in SOILS])
 TRACTION = np.array([s.traction for s in SOILS])
 SLIP_STIFFNESS = np.array([s.slip_stiffness for s in SOILS])

@@ -1,11 +1,9 @@
-"""The PyBullet world: frames of articulated machines as rigid bodies, tyres and soil as forces from outside.
+"""The PyBullet world: machine frames as rigid bodies; tyre and soil forces from outside.
 
-Tyres on soil, for all wheels at once: load, traction, side force, rolling resistance, spin and brakes.
-
-A brush tyre with relaxation length (Pacejka, Tire and Vehicle Dynamics, ch. 7 and 8.5): the tread is a bristle that the
-slip stretches, u' = slip speed - |v| u / sigma, and that pulls with k u, k = stiffness * load / sigma. At a steady slip
-s this is the soil's slip stiffness times s; it levels off at the soil's traction, and at rest the bristles hold
-the machine like springs. All arrays have one shape, that of the wheels.
+Per wheel: load, traction, side force, rolling resistance, spin, brakes. Brush tyre with relaxation length sigma
+(Pacejka, Tire and Vehicle Dynamics, ch. 7 and 8.5): slip stretches a bristle, u' = slip speed - |v| u / sigma, which
+pulls with k u, k = stiffness * load / sigma. At steady slip s: the soil's slip stiffness times s, up to its traction.
+At rest the bristles are springs. All arrays have the wheels' shape.
 """
 
 from __future__ import annotations
@@ -33,14 +31,14 @@ from sim.terrain.terrain import C_RR, SLIP_STIFFNESS, TRACTION, Terrain
 from sim.worlds.bullet_client import MultiBodies
 from sim.worlds.bullet_scene import POINT_FRAME, DriveTrain, Weights, WheelGround, scene_at, state_from_scenes
 
-BRISTLE_DAMPING = 0.3  # of a wheel's share of the machine on its bristles, against critical; nothing at steady slip
-LONGEST_STRETCH = 2.5  # of a bristle, against where its tangent meets the traction limit: then the tread slides
+BRISTLE_DAMPING = 0.3  # share of critical damping; no effect at steady slip
+LONGEST_STRETCH = 2.5  # largest bristle stretch over the stretch whose tangent meets the traction limit
 _NO_FORCE_N = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Actuators:
-    """Actuators of n machines, all (n,): rate of articulation, drive force, and most force of the brakes."""
+    """All (n,): articulation rate, drive force, brake force limit."""
 
     steering_radps: Floats
     drive_n: Floats
@@ -50,7 +48,7 @@ class Actuators:
 class BulletWorld:
     """n machines on one terrain, moved by PyBullet at 100 Hz.
 
-    starts: x, y [m] and yaw [rad] of each `base_link`, (n, 3), where the machines settle on their tyres.
+    starts: x, y [m], yaw [rad] of each `base_link`, (n, 3).
     """
 
     def __init__(self, terrain: Terrain, models: Sequence[MachineModel], bodies: Bodies, starts: Floats) -> None:
@@ -66,7 +64,7 @@ class BulletWorld:
         of_wheels += [chassis.relaxation_m, chassis.wheel_inertia_kgm2]
         of_wheels += [np.broadcast_to(bodies.rolling, len(models))]
         self._tyres = Tyres(*(np.repeat(values[:, None], 4, axis=1) for values in of_wheels))
-        # Unloaded tyres are so large that the nominal machine stands level when empty, hubs at their radius.
+        # Free tyre radii: the nominal empty machine stands level, hubs at their radius.
         sunk_m = 0.5 * np.array([m.mass_kg for m in models]) * GRAVITY_MPS2 / chassis.tyre_stiffness_npm
         share = np.stack([chassis.front_share] * 2 + [1 - chassis.front_share] * 2, axis=-1)
         self._free_radius_m = bodies.wheel_radius_m[:, None] + share * sunk_m[:, None]
@@ -86,14 +84,14 @@ class BulletWorld:
         self.state = replace(self.state, wheel_rad=wheels)
 
     def set_payload(self, machine: int, payload_kg: float) -> None:
-        """Change what one machine carries."""
+        """Change one machine's payload."""
         self._multi.set_payload(machine, payload_kg)
         carried = self._weights.payload_kg.copy()  # past states keep theirs
         carried[machine] = payload_kg
         self._weights = Weights(self._bodies.mass_kg + carried, carried)
 
     def set_terrain(self, terrain: Terrain) -> None:
-        """Change the ground under the machines."""
+        """Replace the ground."""
         self._terrain = terrain
 
     def close(self) -> None:
@@ -101,16 +99,16 @@ class BulletWorld:
         self._multi.close()
 
     def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
-        """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""
+        """Advance by STEP_S; all (n,): target articulation, drive force (signed), brake force limit."""
         self._actuators = self._follow_commands(steer_rad, drive_n, brake_n)
 
-        # What the ground does to the wheels where they are now.
+        # Ground forces at the current places.
         ground, load = self._scene.ground, self._wheel_load_n
         forces = self._roll(ground, load)
         along_wheel = np.stack([forces.traction_n + forces.resistance_n, forces.left_n, load], axis=-1)
         in_map = (along_wheel[..., None, :] @ ground.wheel_from_map)[..., 0, :]
 
-        # Where that takes the machines.
+        # The resulting motion.
         before = self._scene
         self._multi.step(in_map, ground.point_m, self._actuators.steering_radps)
         self._scene = scene_at(self._terrain, self._multi.read(), self._arms_m, ground.point_m)
@@ -122,7 +120,6 @@ class BulletWorld:
         return self.state
 
     def _follow_commands(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> Actuators:
-        """Hydraulics and engine follow with their lags."""
         old = self._actuators
         steering = steering_radps(self._chassis, steer_rad, self.state.articulation_rad, old.steering_radps)
         least = TRACTION[self._scene.ground.zone].min(axis=-1)
@@ -133,7 +130,7 @@ class BulletWorld:
         return radial_load(self._tyres, self._free_radius_m - ground.gap_m, -ground.velocity_mps[..., 2])
 
     def _roll(self, ground: WheelGround, load: Floats) -> TyreForces:
-        """Turn the wheels; drive and brakes are split in proportion to the wheels' loads."""
+        """Drive and brake torque are split by wheel load."""
         motion = WheelMotion(load, ground.velocity_mps[..., 0], ground.velocity_mps[..., 1], ground.zone)
         lever = load * (self._tyres.radius_m / np.maximum(load.sum(axis=-1, keepdims=True), 1.0))
         drive, brake = lever * self._actuators.drive_n[:, None], lever * self._actuators.brake_n[:, None]
@@ -142,7 +139,7 @@ class BulletWorld:
 
 
 def _standing(terrain: Terrain, models: Sequence[MachineModel], starts: Floats) -> Floats:
-    """Place (3) and quaternion (4) of each `base_link` standing straight on the ground under its axles, (n, 7)."""
+    """Position (3) and quaternion (4) of each upright `base_link`, (n, 7)."""
     x, y, yaw = starts.T
     wheelbase, half_track = np.array([[m.wheelbase_m, 0.5 * m.track_m] for m in models]).T
     ahead_x, ahead_y = wheelbase * np.cos(yaw), wheelbase * np.sin(yaw)
@@ -155,14 +152,14 @@ def _standing(terrain: Terrain, models: Sequence[MachineModel], starts: Floats) 
 
 
 def _points(models: Sequence[MachineModel]) -> Floats:
-    """The points of `bullet_scene.POINT_FRAME` in the links of their frames, (n, 5, 3)."""
+    """Points of `bullet_scene.POINT_FRAME` in their links, (n, 5, 3)."""
     robots = [model.robot for model in models]
     return np.array([[*(r.place(w, r.joints[w].parent).xyz_m for w in WHEELS), np.zeros(3)] for r in robots])
 
 
 @dataclass(frozen=True, slots=True)
 class Tyres:
-    """Parameters of wheels. radius: the rolling radius, that relates spin to speed and torque to force.
+    """Tyre parameters. radius: rolling radius; relates spin to speed and torque to force.
 
     rolling: factor on the soil's rolling resistance.
     """
@@ -177,7 +174,7 @@ class Tyres:
 
 @dataclass(frozen=True, slots=True)
 class TyreState:
-    """State of wheels: spin, and the bristles' stretch ahead and to the left."""
+    """Wheel spin, and bristle stretch ahead and to the left."""
 
     spin_radps: Floats
     ahead_m: Floats
@@ -186,7 +183,7 @@ class TyreState:
 
 @dataclass(frozen=True, slots=True)
 class WheelMotion:
-    """How wheels touch the ground: load [N], speed of the hub over it, ahead and to the left, and the soil's zone."""
+    """Load [N], hub speed over ground ahead and to the left, soil zone."""
 
     load_n: Floats
     ahead_mps: Floats
@@ -196,9 +193,9 @@ class WheelMotion:
 
 @dataclass(frozen=True, slots=True)
 class TyreForces:
-    """Forces of the ground on wheels, and the net torque of drive and brake.
+    """Ground forces on wheels, and net torque of drive and brake.
 
-    traction: ahead, without resistance: the rolling resistance, against the motion. left: sideways.
+    traction: ahead, without resistance. resistance: rolling, against the motion. left: sideways.
     """
 
     traction_n: Floats
@@ -208,12 +205,12 @@ class TyreForces:
 
 
 def at_rest(shape: tuple[int, ...]) -> TyreState:
-    """Wheels that stand, bristles relaxed."""
+    """Standing wheels with relaxed bristles."""
     return TyreState(np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
 
 def radial_load(tyres: Tyres, squash_m: Floats, squash_mps: Floats) -> Floats:
-    """Load [N] of tyres squashed so far (negative: in the air) and at this rate; the ground never pulls."""
+    """Load [N] of tyres from compression (negative: in the air) and its rate; never negative."""
     load = tyres.stiffness_npm * squash_m + tyres.damping_nspm * squash_mps
     return np.where(squash_m > 0, np.maximum(load, 0.0), 0.0)
 
@@ -221,27 +218,27 @@ def radial_load(tyres: Tyres, squash_m: Floats, squash_mps: Floats) -> Floats:
 def turn_wheels(
     tyres: Tyres, state: TyreState, motion: WheelMotion, drive_nm: Floats, brake_nm: Floats, dt: float
 ) -> tuple[TyreState, TyreForces]:
-    """Turn wheels by one step. drive_nm: torque on each wheel; brake_nm: the most its brake can hold.
+    """Turn wheels by one step. drive_nm: torque per wheel. brake_nm: limit.
 
-    Spin and bristles are one stiff system: stepped implicitly with the bristles' stiffness of the step's start.
+    Spin and bristles are one stiff system: one implicit step, bristle stiffness from its start.
     """
     load, zone, radius = motion.load_n, motion.zone, tyres.radius_m
     limit = TRACTION[zone] * load
     stiffness = SLIP_STIFFNESS[zone] * load / tyres.relaxation_m
     damping = (2 * BRISTLE_DAMPING) * np.sqrt(stiffness * load / GRAVITY_MPS2)
 
-    # Share of the spring's force that is left near the traction limit, ahead and sideways together.
+    # Share of the spring force left near the traction limit, both directions combined.
     pull = stiffness * np.hypot(state.ahead_m, state.left_m) + _NO_FORCE_N
     limit_or_one = np.maximum(limit, 1.0)
     share = limit * np.tanh(pull / limit_or_one) / pull
 
-    # A stretch changes to (stretch + dt * slip speed) * keep and pulls with hard * stretch - soft * old stretch.
+    # New stretch = (stretch + dt * slip speed) * keep; force = hard * stretch - soft * old stretch.
     rolling = np.maximum(np.abs(motion.ahead_mps), np.abs(state.spin_radps * radius))
     keep = 1 / (1 + rolling * (dt / tyres.relaxation_m))
     soft = share * damping / dt
     hard = share * stiffness + soft
 
-    # Spin: the bristles' pull is linear in it; the brake then takes what it can, down to standstill.
+    # Spin: the bristle force is linear in it. Then the brake, limited by standstill.
     gain = hard * keep
     at_still = gain * (state.ahead_m - dt * motion.ahead_mps) - soft * state.ahead_m
     inertia = tyres.inertia_kgm2 + gain * (dt * radius) ** 2

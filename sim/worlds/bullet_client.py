@@ -1,6 +1,6 @@
-"""The only calls of PyBullet's physics: it moves the frames of machines under given forces, without ground.
+"""All calls of PyBullet's physics: machine frames under given forces, without ground.
 
-PyBullet is imported without the line about its build that it writes to standard error.
+The line that its import prints to standard error is suppressed.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from protocol.units import GRAVITY_MPS2
 from sim.machines.model import PAYLOAD, WHEELS, MachineModel
 from sim.machines.urdf import rigid_urdf
 
-OSCILLATION_NM = 2000.0  # friction of the joint that lets all wheels touch
-FRAMES = 3  # that are watched: rear frame, front frame, and the carrier of the rear wheels
+OSCILLATION_NM = 2000.0  # of the joint that lets all wheels touch the ground
+FRAMES = 3  # rear frame, front frame, carrier of the rear wheels
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Frames of machines in `map`, arrays (n, FRAMES, ...): centre of mass, rotation, velocity and angular rate."""
+    """Machine frames in `map`, arrays (n, FRAMES, ...): centre of mass, rotation, velocity, angular rate."""
 
     centre_m: Floats
     rotation: Floats
@@ -38,7 +38,7 @@ class Frames:
 
 @dataclass(frozen=True)
 class _Machine:
-    """What PyBullet calls a machine: its number, and those of links and joints; -1 is the rear frame."""
+    """PyBullet's indices of one machine; -1 is the rear frame."""
 
     body: int
     front: int
@@ -49,15 +49,15 @@ class _Machine:
 
     @cached_property
     def links(self) -> list[int]:
-        """Links to watch beside the rear frame."""
+        """Links besides the rear frame."""
         return [self.front] if self.rear < 0 else [self.front, self.rear]
 
 
 class MultiBodies:
-    """n machines in one PyBullet client; close() frees it, as does the garbage collector."""
+    """n machines in one PyBullet client, freed by close() or the garbage collector."""
 
     def __init__(self, models: Sequence[MachineModel], mass_factor: Floats, base_pose: Floats, dt: float) -> None:
-        """base_pose: (n, 7), place and quaternion (x, y, z, w) of each `base_link`."""
+        """base_pose: (n, 7), position and quaternion (x, y, z, w) of each `base_link`."""
         self._client = pybullet.connect(pybullet.DIRECT)
         self.close = weakref.finalize(self, pybullet.disconnect, self._client)
         pybullet.setGravity(0, 0, -GRAVITY_MPS2, physicsClientId=self._client)
@@ -70,11 +70,11 @@ class MultiBodies:
         machines, client = self._machines, self._client
         links = [[pybullet.getDynamicsInfo(m.body, link, client) for link in (-1, m.front, m.rear)] for m in machines]
         inertial = np.array([[[*info[3], *info[4]] for info in own] for own in links])
-        self.centres_m = inertial[:, :, :3]  # of mass, in the links' own axes: (n, FRAMES, 3)
+        self.centres_m = inertial[:, :, :3]  # centres of mass in the links' axes: (n, FRAMES, 3)
         self._link_from_inertial = np.swapaxes(rotations(inertial[:, :, 3:]), -1, -2)
 
     def read(self) -> Frames:
-        """Read where all frames are, and how they move."""
+        """Read pose and motion of all frames."""
         client, flat = self._client, list[float]()
         for machine in self._machines:
             body = machine.body
@@ -83,7 +83,7 @@ class MultiBodies:
             for part in base:
                 flat += part
             for link in links:
-                flat += link[0]  # centre of mass, as for the base; the frames of links come in single precision
+                flat += link[0]  # centre of mass: PyBullet's link frames are single precision
                 flat += link[1]
                 flat += link[6]
                 flat += link[7]
@@ -95,7 +95,7 @@ class MultiBodies:
         return Frames(table[:, :, :3], rotation, table[:, :, 7:10], table[:, :, 10:])
 
     def step(self, forces_n: Floats, points_m: Floats, steering_radps: Floats) -> None:
-        """Advance by dt with one force per wheel (n, 4, 3) at a point in `map`, and this rate of articulation (n,)."""
+        """Advance by dt. Per wheel a force (n, 4, 3) at a point in `map`; articulation rates (n,)."""
         client, apply, map_frame = self._client, pybullet.applyExternalForce, pybullet.WORLD_FRAME
         rows = zip(
             self._machines, self._steer_nm, forces_n.tolist(), points_m.tolist(), steering_radps.tolist(), strict=True
@@ -110,7 +110,7 @@ class MultiBodies:
         pybullet.stepSimulation(client)
 
     def set_payload(self, machine: int, payload_kg: float) -> None:
-        """Change what one machine carries."""
+        """Change one machine's payload."""
         m = self._machines[machine]
         inertia = [payload_kg * i for i in m.payload_inertia_m2]
         pybullet.changeDynamics(
@@ -138,7 +138,7 @@ class MultiBodies:
         return _Machine(body, links[FRONT], links[rear], links[PAYLOAD], names["articulation"], inertia)
 
     def _remove_damping(self, body: int, joints: dict[str, int]) -> None:
-        """Take away the damping and joint friction that PyBullet adds by itself."""
+        """Remove PyBullet's default damping and friction."""
         for link in (-1, *joints.values()):
             pybullet.changeDynamics(
                 body, link, linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=self._client
@@ -152,7 +152,7 @@ def _turn_joint(client: int, body: int, joint: int, radps: float, most_nm: float
 
 
 def _rotation(squares: Floats) -> Floats:
-    """The matrix (9,) of a quaternion from the products (4, 4) of its x, y, z, w: linear in these."""
+    """Matrix (9,) of a quaternion x, y, z, w, linear in its products (4, 4)."""
     vector, (x, y, z, w) = squares[:3, :3], squares[3]
     turn = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     matrix: Floats = (w - np.trace(vector)) * np.eye(3) + 2 * vector + 2 * turn
@@ -163,7 +163,7 @@ _ROTATIONS = np.array([_rotation(unit) for unit in np.eye(16).reshape(16, 4, 4)]
 
 
 def rotations(quaternions: Floats) -> Floats:
-    """Matrices (..., 3, 3) of unit quaternions (..., 4) x, y, z, w; at every step, so as one matrix product."""
+    """Matrices (..., 3, 3) of unit quaternions (..., 4) x, y, z, w, as one matrix product for speed."""
     squares = quaternions[..., :, None] * quaternions[..., None, :]
     flat: Floats = squares.reshape(-1, 16) @ _ROTATIONS
     return flat.reshape(*quaternions.shape[:-1], 3, 3)
@@ -171,10 +171,10 @@ def rotations(quaternions: Floats) -> Floats:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Send what libraries write to standard error, past Python, nowhere."""
+    """Discard standard error, native code's too."""
     try:
         saved = os.dup(2)
-    except OSError:  # standard error is closed: nothing to hide
+    except OSError:  # standard error is closed
         yield
         return
     nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -1,7 +1,4 @@
-"""Scenes of rigid frames, for arrays of machines: points on the frames, and the ground under their wheels.
-
-Two scenes one step apart give the machines' state.
-"""
+"""Scenes: points on rigid frames and the ground under their wheels. Two scenes one step apart give a state."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from sim.state import STEP_S, FleetState
 from sim.terrain.terrain import C_RR, Terrain
 from sim.worlds.bullet_client import Frames
 
-# Points that are followed, and the frame that each is fixed to: hubs and `base_link`.
+# Tracked points and their frames: hubs, `base_link`.
 HUBS, BASE_POINT = slice(0, 4), 4
 POINT_FRAME = [1, 1, 2, 2, 0]
 _GRAVITY_UP = np.array([0.0, 0.0, GRAVITY_MPS2])
@@ -28,7 +25,7 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Points on machines, (n, 5, 3) in `map`: where they are and how they move."""
+    """Position and velocity of machine points, (n, 5, 3) in `map`."""
 
     xyz_m: Floats
     velocity_mps: Floats
@@ -36,10 +33,10 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class WheelGround:
-    """Where wheels meet the ground; arrays (n, 4, ...).
+    """Wheel contacts; arrays (n, 4, ...).
 
-    point_m: the place on the ground nearest to the hub. wheel_from_map: rows ahead, left and up of the ground there.
-    gap_m: from hub to ground. velocity: of the hub along those rows.
+    point_m: ground point nearest to the hub. wheel_from_map: rows ahead, left, up there. gap_m: hub to ground.
+    velocity: of the hub along the rows.
     """
 
     point_m: Floats
@@ -59,7 +56,7 @@ class BodyScene:
 
 
 class DriveTrain(NamedTuple):
-    """Drive train over one step: drive force, torque of all wheels together; spin and angle of the rear ones (n, 2)."""
+    """Over one step: drive force, torque of all wheels; spin and angle of the rear wheels (n, 2)."""
 
     drive_n: Floats
     torque_nm: Floats
@@ -68,35 +65,35 @@ class DriveTrain(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """Mass of machines with their payload, and of the payload alone, both (n,)."""
+    """Mass with payload, and of the payload alone, both (n,)."""
 
     mass_kg: Floats
     payload_kg: Floats
 
 
 def scene_at(terrain: Terrain, frames: Frames, arms_m: Floats, guess_m: Floats | None = None) -> BodyScene:
-    """Find the points of frames and the ground under their wheels; guess_m: the ground's points before."""
+    """Points and wheel contacts of frames. guess_m: previous ground points."""
     points = points_on(frames, arms_m)
     guess = points.xyz_m[:, HUBS] if guess_m is None else guess_m
     return BodyScene(frames, points, ground_under(terrain, frames, points, guess))
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """Cross product along the last axis (numpy's costs ten times as much on a handful of machines)."""
+    """Cross product along the last axis; numpy's takes ten times as long for a few machines."""
     matrix = (a @ _LEVI_CIVITA).reshape(*a.shape[:-1], 3, 3)
     product: Floats = (matrix @ b[..., None])[..., 0]
     return product
 
 
 def points_on(frames: Frames, arms_m: Floats) -> Points:
-    """Move points that lie at arms_m (n, 5, 3) from their frame's centre of mass, along its axes."""
+    """Points at arms_m (n, 5, 3) from their frame's centre of mass, along its axes."""
     arms = (frames.rotation[:, POINT_FRAME] @ arms_m[..., None])[..., 0]
     turning = cross(frames.rate_radps[:, POINT_FRAME], arms)
     return Points(frames.centre_m[:, POINT_FRAME] + arms, frames.velocity_mps[:, POINT_FRAME] + turning)
 
 
 def ground_under(terrain: Terrain, frames: Frames, points: Points, guess_m: Floats) -> WheelGround:
-    """Find the ground under wheels. guess_m: the previous points on it; the hub's foot moves little in a step."""
+    """Ground under wheels. guess_m: previous ground points, which move little per step."""
     x, y = guess_m[..., 0], guess_m[..., 1]
     height, east, north = terrain.surface(x, y)
     hub = points.xyz_m[:, HUBS]
@@ -124,7 +121,7 @@ def attitude(rotation: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def plane_gradient(points_m: Floats) -> tuple[Floats, Floats]:
-    """Gradient, east and north, of the plane through four wheels' points (n, 4, 3)."""
+    """Gradient, east and north, of the plane through four wheel points (n, 4, 3)."""
     ahead = points_m[:, 0] + points_m[:, 1] - points_m[:, 2] - points_m[:, 3]
     left = points_m[:, 0] - points_m[:, 1] + points_m[:, 2] - points_m[:, 3]
     normal = cross(ahead, left)
@@ -132,7 +129,7 @@ def plane_gradient(points_m: Floats) -> tuple[Floats, Floats]:
 
 
 def articulation(rotation: Floats) -> Floats:
-    """Angle (n,) from the rear to the front frame about the rear frame's upright axis; rotation (n, frames, 3, 3)."""
+    """Angle (n,) from rear to front frame about the rear's upright axis; rotation (n, frames, 3, 3)."""
     front, rear = rotation[:, 1, :, 0], rotation[:, 0]
     angle: Floats = np.arctan2(np.vecdot(front, rear[:, :, 1]), np.vecdot(front, rear[:, :, 0]))
     return angle
@@ -141,9 +138,9 @@ def articulation(rotation: Floats) -> Floats:
 def state_from_scenes(
     before: BodyScene, now: BodyScene, load_n: Floats, weights: Weights, drive: DriveTrain
 ) -> FleetState:
-    """The state of machines. load_n: of each wheel, (n, 4).
+    """State of machines from two scenes. load_n: per wheel, (n, 4).
 
-    Accelerations are differences over the step, as an accelerometer that averages over its interval has them.
+    Accelerations are means over the step, like an accelerometer's over its interval.
     """
     rates, rates_dot, force = _inertial(before, now)
     yaw, pitch, roll = attitude(now.frames.rotation[:, 0])
@@ -180,7 +177,7 @@ def state_from_scenes(
 
 
 def _inertial(before: BodyScene, now: BodyScene) -> tuple[Floats, Floats, Floats]:
-    """Rate, its derivative, and specific force at `base_link`, each (n, 3) in its axes."""
+    """Angular rate, its derivative and specific force at `base_link`, each (n, 3) in its axes."""
     old_rates, rates = _in_base(before.frames.rate_radps[:, 0], before), _in_base(now.frames.rate_radps[:, 0], now)
     change_mps = now.points.velocity_mps[:, BASE_POINT] - before.points.velocity_mps[:, BASE_POINT]
     force = change_mps / STEP_S + _GRAVITY_UP
@@ -188,7 +185,6 @@ def _inertial(before: BodyScene, now: BodyScene) -> tuple[Floats, Floats, Floats
 
 
 def _in_base(vector: Floats, scene: BodyScene) -> Floats:
-    """Vectors (n, 3) of `map` along the axes of `base_link`."""
     turned: Floats = (vector[:, None, :] @ scene.frames.rotation[:, 0])[:, 0]
     return turned
 
@@ -199,7 +195,6 @@ def _speed(scene: BodyScene) -> Floats:
 
 
 def _bending(scene: BodyScene) -> Floats:
-    """Rate of the joint's angle."""
     rate = scene.frames.rate_radps
     bending: Floats = np.vecdot(rate[:, 1] - rate[:, 0], scene.frames.rotation[:, 0, :, 2])
     return bending

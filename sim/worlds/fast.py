@@ -1,8 +1,8 @@
-"""The fast world: articulated machines as kinematics of two frames, all at once (numba, no PyBullet).
+"""The fast world: articulated machines as two-frame kinematics, all at once (numba, no PyBullet).
 
-Neither axle slips sideways. Along the track, drive force and brakes against rolling resistance, gravity and the inertia
-of the body and its wheels. One joint lets all wheels touch, so the rear frame rests on three points: one axle's wheels
-and the other axle's centre; their plane is its attitude once the tyres have settled.
+No axle slips sideways. Along the track: drive force, brakes, rolling resistance, gravity, inertia of body and wheels.
+One joint lets all wheels touch, so the rear frame rests on three points: one axle's wheels and the other's centre.
+Their plane is its attitude with settled tyres.
 """
 
 from __future__ import annotations
@@ -24,17 +24,16 @@ from sim.worlds import fast_kernels as k
 _CONSTANTS = k.Constants(STEP_S, GRAVITY_MPS2, chassis.STANDSTILL_MPS, chassis.TRACTION_USE)
 _SOILS = np.array([C_RR, TRACTION, SLIP_STIFFNESS])
 
-# One machine in the state array (n,): what `FleetState` explains, and what the next step needs beside it.
-# grip: the most drive force. crab: how far a machine moves off its heading to the left, because tyres push sideways
-# only while they slip sideways. centre, ride: acceleration of the body's centre ahead, and how high it is. *_aim: where
-# ride, pitch and roll would settle if the tyres gave way as under the empty machine.
+# State (n,): fields of `FleetState` and what the next step needs. grip: drive force limit. crab: angle from heading to
+# motion, to the left, because side force needs slip. centre, ride: forward acceleration and height of the body's
+# centre. *_aim: equilibrium of ride, pitch, roll with the tyre deflection of the empty machine.
 _IN_BOTH = [field.name for field in fields(FleetState) if field.name not in ("mass_kg", "payload_kg")]
 _BESIDE = ("grip_n", "crab_rad", "centre_mps2", "ride_m", "ride_mps", "ride_aim_m", "pitch_aim_rad", "roll_aim_rad")
 _AXES = {"rates_radps": 3, "rates_dot_radps2": 3, "force_mps2": 3, "wheel_radps": 2, "wheel_rad": 2}
 STATE = np.dtype([(name, "f8", _AXES.get(name, ())) for name in (*_IN_BOTH, *_BESIDE)])
 
-# One machine's parameters, as `chassis.Chassis` and `chassis.Weight` explain them. level_*: how far an axle's tyres
-# give way under the nominal machine, empty, which stands level on them.
+# Parameters, as in `chassis.Chassis` and `chassis.Weight`. level_*: tyre deflection per axle of the nominal empty
+# machine, which stands level.
 _OF_TYRES = ("tyre_stiffness_npm", "tyre_damping_nspm", "wheel_radius_m", "wheel_inertia_kgm2")
 _OF_BODY = ("rear_to_joint_m", "front_to_joint_m", "half_track_m", "level_front_m", "level_rear_m")
 _FIGURES = (*_OF_BODY, *_OF_TYRES, "rolling", "skid_grip", *chassis.Weight._fields)
@@ -59,7 +58,7 @@ class FastWorld:
             self.advance(np.zeros(n), np.zeros(n), np.full(n, np.inf))
 
     def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
-        """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""
+        """Advance by STEP_S; all (n,): target articulation, drive force (signed), brake force limit."""
         rows, own = self._rows, self._chassis
         steering = chassis.steering_radps(own, steer_rad, rows["articulation_rad"], rows["articulation_radps"])
         drive = chassis.drive_force_n(own, drive_n, rows["drive_n"], rows["grip_n"])
@@ -70,14 +69,14 @@ class FastWorld:
         return self.state
 
     def set_payload(self, machine: int, payload_kg: float) -> None:
-        """Change what one machine carries."""
+        """Change one machine's payload."""
         carried = self._payload_kg.copy()  # past states keep theirs
         carried[machine] = payload_kg
         self._payload_kg = carried
         self._weigh()
 
     def set_terrain(self, terrain: Terrain) -> None:
-        """Change the ground under the machines."""
+        """Replace the ground."""
         self._terrain = terrain
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
-"""One step of the fast world's machines, compiled by numba.
+"""One step of the fast world, compiled by numba.
 
-numba's cache notices changes in the file of the function that is called, and in no other: constants of other files are
-passed in, and after a change in `terrain/terrain.py` this file is to be touched.
+numba's cache only sees changes in the called function's own file: constants of other modules are passed in, and this
+file must be touched after a change in `terrain/terrain.py`.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from protocol.arrays import Floats, Table
 from sim.terrain.terrain import TerrainGrid, surface, zone
 
 _compiled = numba.njit(cache=True, inline="always", error_model="numpy")
-Record = Any  # one of `fast.STATE` or `fast.MACHINE`: numba reads and writes its fields as attributes
+Record = Any  # a record of `fast.STATE` or `fast.MACHINE`, fields as attributes
 
 
 class Constants(NamedTuple):
-    """Numbers of other modules."""
+    """Constants of other modules."""
 
     dt_s: float
     gravity: float
@@ -29,7 +29,7 @@ class Constants(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Where a machine is after a step, and how fast it moves and turns."""
+    """Pose and motion after a step."""
 
     x: float
     y: float
@@ -40,7 +40,7 @@ class Moved(NamedTuple):
 
 
 class RearAxle(NamedTuple):
-    """The rear axle's centre, and the direction of the rear frame."""
+    """Rear axle's centre, rear frame's direction."""
 
     x: float
     y: float
@@ -49,11 +49,11 @@ class RearAxle(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """The ground under a machine.
+    """Ground under a machine.
 
-    z: below the rear axle. slope: of the plane on which the rear frame rests, along its axes. climb: mean slope of the
-    ground right under an axle's wheels, in their direction. grade: of the plane through all wheels, in `map`. zones:
-    front left, front right, rear left, rear right.
+    z: below the rear axle. slope: of the plane that carries the rear frame, in its axes. climb: mean slope under an
+    axle's wheels, in their direction. grade: of the plane through all wheels, in `map`. zones: front left, front right,
+    rear left, rear right.
     """
 
     z: float
@@ -67,11 +67,10 @@ class Contact(NamedTuple):
 
 
 class Rates(NamedTuple):
-    """How a machine moves.
+    """Motion of a machine.
 
-    turning: of the rear frame. accel: of the body's centre, ahead, and force_left: specific force to the left, both of
-    the last step.
-    lifting: acceleration of its centre off the ground. riding: how fast the centre rises. pitch, pitching: nose down.
+    turning: of the rear frame. accel: of the body's centre, ahead; force_left: specific force; both from the last step.
+    lifting, riding: acceleration and speed of the centre off the ground. pitch, pitching: nose down.
     """
 
     speed: float
@@ -86,11 +85,10 @@ class Rates(NamedTuple):
 
 
 class Forces(NamedTuple):
-    """Forces along the track, and what follows from them.
+    """Forces along the track and their results.
 
-    grip: the most drive force that spins up no wheel. tyres: the tyres' force under drive and brakes. accel, centre: of
-    `base_link` and of the body's centre. crab: angle by which all wheels slip sideways. wheel_ratio: wheel speed over
-    ground speed.
+    grip: drive force limit without wheel spin. tyres: force from drive and brakes. accel, centre: of `base_link` and of
+    the body's centre. crab: side slip angle. wheel_ratio: wheel speed over ground speed.
     """
 
     load: float
@@ -110,12 +108,12 @@ def advance(
 ) -> Table:  # fmt: skip
     """Advance machines by one step.
 
-    soils: resistance, traction and slip stiffness of each zone, (3, zones). machines: MACHINE (n,). old: STATE (n,).
-    The rest (n,): rate of articulation, drive force, and most force of the brakes.
+    soils: resistance, traction and slip stiffness per zone, (3, zones). machines: MACHINE (n,). old: STATE (n,). The
+    rest (n,): articulation rate, drive force, brake force limit.
     """
     new = np.empty_like(old)
     for i in range(old.size):
-        # Move, then look up the ground at the new place, and the forces there.
+        # Move, then evaluate ground and forces there.
         m, before, now = machines[i], old[i], new[i]
         moved = _move(k.dt_s, m, before, steering[i])
         ground = _touch(m, grid, moved)
@@ -148,7 +146,7 @@ def advance(
 
 @_compiled
 def settle(machines: Table, grid: TerrainGrid, state: Table) -> None:
-    """Put bodies, STATE (n,), down where they will rest."""
+    """Place bodies, STATE (n,), at their equilibrium."""
     for i in range(state.size):
         m, now = machines[i], state[i]
         at = Moved(now.x_m, now.y_m, now.yaw_rad, now.articulation_rad, 0.0, 0.0)
@@ -158,9 +156,9 @@ def settle(machines: Table, grid: TerrainGrid, state: Table) -> None:
 
 @_compiled
 def _move(dt: float, m: Record, before: Record, steering: float) -> Moved:
-    """Move both frames; neither axle slips sideways.
+    """No axle slips sideways.
 
-    With arms L_r and L_f to the joint: (L_f + L_r cos g) dyaw/dt = v sin g - L_f dg/dt.
+    With arms L_r, L_f to the joint: (L_f + L_r cos g) dyaw/dt = v sin g - L_f dg/dt.
     """
     rear, front = m.rear_to_joint_m, m.front_to_joint_m
     bend, speed = before.articulation_rad + dt * steering, before.speed_mps + dt * before.accel_mps2
@@ -172,9 +170,8 @@ def _move(dt: float, m: Record, before: Record, steering: float) -> Moved:
 
 @_compiled
 def _touch(m: Record, grid: TerrainGrid, at: Moved) -> Contact:
-    """Look up the ground under the wheels."""
-    # From the rear axle's centre, along the rear frame's axes: the front axle's centre, and the left half of the axle.
-    bend = 0.0 if m.skid_grip > 0 else at.bend  # a rigid machine's joint only stands for its steering
+    # From the rear axle's centre in the rear frame's axes: the front axle's centre, and its left half.
+    bend = 0.0 if m.skid_grip > 0 else at.bend  # a rigid machine's joint only represents steering
     cf, sf = math.cos(bend), math.sin(bend)
     ahead_x = m.rear_to_joint_m + m.front_to_joint_m * cf
     ahead_y = m.front_to_joint_m * sf
@@ -205,7 +202,7 @@ def _touch(m: Record, grid: TerrainGrid, at: Moved) -> Contact:
 
 @_compiled
 def _under(grid: TerrainGrid, at: RearAxle, ahead: float, left: float) -> tuple[float, float, float, int]:
-    """Height, its slopes to the east and north, and the zone at a place relative to the rear axle's centre."""
+    """Height, slopes east and north, zone at a place relative to the rear axle's centre."""
     x, y = at.x + at.cos_yaw * ahead - at.sin_yaw * left, at.y + at.sin_yaw * ahead + at.cos_yaw * left
     height, east, north = surface(grid, x, y)
     return height, east, north, zone(grid, x, y)
@@ -213,7 +210,7 @@ def _under(grid: TerrainGrid, at: RearAxle, ahead: float, left: float) -> tuple[
 
 @_compiled
 def _plane(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> tuple[float, float]:
-    """Slopes along x and y of the plane that two vectors span."""
+    """Slopes along x and y of the plane spanned by two vectors."""
     area = ax * by - ay * bx
     return (az * by - bz * ay) / area, (bz * ax - az * bx) / area
 
@@ -222,8 +219,7 @@ def _plane(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> 
 def _forces(
     k: Constants, soils: Floats, m: Record, ground: Contact, rates: Rates, drive: float, brake: float
 ) -> Forces:
-    """Forces along the track."""
-    # The ground's normal force, shifted to the rear uphill, under power and as the nose drops; what soil makes of it.
+    # Normal force, shifted to the rear uphill, under power and as the nose drops; then soil forces.
     speed, weight = rates.speed, m.mass_kg * k.gravity
     level = weight / math.sqrt(1 + ground.grade_e**2 + ground.grade_n**2)
     load = max(level + m.mass_kg * rates.lifting, 0.1 * level)
@@ -238,13 +234,13 @@ def _forces(
     traction = _borne(soils[1], ground.zones, front, load)
     stiffness = _borne(soils[2], ground.zones, front, load)
 
-    # Brakes take what they can, down to standstill at the end of the next step, and hold it there.
-    # Of a body that pitches, `base_link` moves otherwise than its centre, v' + q' h = F / m - q w.
+    # Brakes hold at most to standstill at the end of the next step. If the body pitches, `base_link` moves differently
+    # from its centre: v' + q' h = F / m - q w.
     centre_mps = speed + rates.pitching * m.centre_height_m
     upward_mps = rates.riding * math.cos(nose_up) - centre_mps * math.sin(nose_up)
     tipping = m.mass_kg * (rates.pitching_dot * m.centre_height_m + rates.pitching * upward_mps)
     inertia = m.mass_kg + 4 * m.wheel_inertia_kgm2 / m.wheel_radius_m**2
-    # Wheels under side force slip sideways; in a curve, v' = F / m + w v_left then slows the machine down.
+    # Side force needs side slip; in a curve, v' = F / m + w v_left then slows the machine down.
     moving = math.tanh(speed / k.standstill_mps)
     crab = -m.mass_kg * rates.force_left / stiffness * moving
     drag = -m.mass_kg * rates.turning * speed * crab
@@ -253,7 +249,7 @@ def _forces(
     most = k.traction_use * traction
     tyres = min(max(drive - min(max(to_stop, -brake), brake), -most), most)
 
-    # Slip refers to the faster of wheel and ground: pushing, v = wheel (1 - slip), holding back, wheel = v (1 - slip).
+    # Slip refers to the faster of wheel and ground. Driving: v = wheel (1 - slip). Braking: wheel = v (1 - slip).
     slower = 1 - math.atanh(abs(tyres) / traction) * traction / stiffness
     ratio = 1 / slower if tyres * speed > 0 else slower
     fl, fr, rl, rr = ground.zones
@@ -264,10 +260,10 @@ def _forces(
 
 @_compiled
 def _skidding(m: Record, rates: Rates, load: float) -> float:
-    """What a turn costs wheels or tracks that slide sideways.
+    """Resistance of a turn for wheels or tracks that slide sideways.
 
-    Those at both ends slide by the angle L / (2 R); with side force over load mu, in full from 0.1 rad on, they turn
-    against mu load L / 4. The drive works against that moment at the turn rate: force = moment / R.
+    End wheels slide by the angle L / (2 R). With side force over load mu, full from 0.1 rad, the turn takes a moment mu
+    load L / 4; force = moment / R.
     """
     if m.skid_grip == 0.0:
         return 0.0
@@ -279,7 +275,7 @@ def _skidding(m: Record, rates: Rates, load: float) -> float:
 
 @_compiled
 def _borne(values: Floats, zones: tuple[int, int, int, int], front: float, load: float) -> float:
-    """Sum of a soil's value times the wheels' loads; the wheels of an axle bear the same."""
+    """Sum of a soil value times wheel load; an axle's wheels share its load equally."""
     fl, fr, rl, rr = zones
     ahead, behind = values[fl] + values[fr], values[rl] + values[rr]
     total: float = 0.5 * (front * ahead + (load - front) * behind)
@@ -288,7 +284,6 @@ def _borne(values: Floats, zones: tuple[int, int, int, int], front: float, load:
 
 @_compiled
 def _turn_wheels(dt: float, radps_per_mps: float, half_track: float, at: Moved, before: Record, now: Record) -> None:
-    """Turn the rear wheels, each as fast as its side moves."""
     faster = at.turning * half_track
     now.wheel_radps[0], now.wheel_radps[1] = (at.speed - faster) * radps_per_mps, (at.speed + faster) * radps_per_mps
     for side in range(2):
@@ -297,7 +292,7 @@ def _turn_wheels(dt: float, radps_per_mps: float, half_track: float, at: Moved, 
 
 @_compiled
 def _aim(m: Record, ground: Contact, now: Record) -> None:
-    """Where the body would settle on the plane that carries it, if its tyres gave way as under the empty machine."""
+    """Equilibrium of the body, with the tyre deflection of the empty machine."""
     slope = math.sqrt(1 + ground.slope_ahead**2)
     now.pitch_aim_rad = -math.atan(ground.slope_ahead)
     now.roll_aim_rad = math.atan(ground.slope_left / slope)
@@ -306,7 +301,7 @@ def _aim(m: Record, ground: Contact, now: Record) -> None:
 
 @_compiled
 def _ride(k: Constants, m: Record, ground: Contact, old: Record, now: Record) -> None:
-    """Let the body bounce, pitch and roll on its tyres; the joint leaves roll to the wheels of one axle."""
+    """The joint leaves roll to the wheels of one axle."""
     _aim(m, ground, now)
     wheelbase = m.rear_to_joint_m + m.front_to_joint_m
     ahead = m.front_share * wheelbase
@@ -326,7 +321,7 @@ def _ride(k: Constants, m: Record, ground: Contact, old: Record, now: Record) ->
 
 @_compiled
 def _sunk(k: Constants, m: Record, ground: Contact, accel: float) -> tuple[float, float]:
-    """How far the front and the rear tyres give way under a body at rest on them, beyond those of the empty machine."""
+    """Static deflection of front and rear tyres beyond that of the empty machine."""
     slope = math.sqrt(1 + ground.slope_ahead**2)
     level = m.mass_kg * k.gravity / slope
     shifted = (level * ground.slope_ahead + m.mass_kg * accel) * m.centre_height_m
@@ -339,10 +334,10 @@ def _sunk(k: Constants, m: Record, ground: Contact, accel: float) -> tuple[float
 def _spring(
     dt: float, m: Record, ease: float, old: tuple[float, float, float], aim: float, pushed: float
 ) -> tuple[float, float]:
-    """One step of a value on tyres, towards an aim that moves; returns the value and its rate.
+    """One step of a sprung value towards a moving equilibrium; returns value and rate.
 
-    old: value, rate and aim. ease: lever arms of the tyres squared, over inertia. pushed: how far from its aim the
-    weight on the tyres holds it.
+    old: value, rate, equilibrium. ease: squared lever arms of the tyres over inertia. pushed: static offset under the
+    weight.
     """
     value, rate, old_aim = old
     force = m.tyre_stiffness_npm * (aim + pushed - value) + m.tyre_damping_nspm * ((aim - old_aim) / dt - rate)
@@ -361,7 +356,7 @@ def _inertial(k: Constants, m: Record, moved: Moved, rates: Rates, before: Recor
     now.rates_radps[2] = about_z
     for axis in range(3):
         now.rates_dot_radps2[axis] = (now.rates_radps[axis] - before.rates_radps[axis]) / k.dt_s
-    # The rear axle is raised as the centre is, and by the pitch.
+    # The rear axle rises with the centre, and by the pitch.
     raised = rates.lifting + m.front_share * (m.rear_to_joint_m + m.front_to_joint_m) * rates.pitching_dot
     now.force_mps2[0] = now.accel_mps2 - k.gravity * sp
     now.force_mps2[1] = moved.speed * about_z + k.gravity * cp * sr

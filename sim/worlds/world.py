@@ -1,4 +1,4 @@
-"""What a world offers that moves machines; there are two of them, `bullet` and `fast`."""
+"""Interface of the worlds `bullet` and `fast`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sim.terrain.terrain import Terrain
 
 
 class World(Protocol):
-    """Moves all machines of a site, under the commands of their drivers; they start straight, empty and at rest.
+    """Moves all machines of a site; they start straight, empty, at rest.
 
     state: after the last step.
     """
@@ -18,17 +18,17 @@ class World(Protocol):
     state: FleetState
 
     def advance(self, steer_rad: Floats, drive_n: Floats, brake_n: Floats) -> FleetState:
-        """Advance by STEP_S; all (n,): articulation to aim at, drive force (signed), most force of the brakes."""
+        """Advance by STEP_S; all (n,): target articulation, drive force (signed), brake force limit."""
         ...
 
     def set_payload(self, machine: int, payload_kg: float) -> None:
-        """Change what one machine carries."""
+        """Change one machine's payload."""
         ...
 
     def set_terrain(self, terrain: Terrain) -> None:
-        """Change the ground under the machines."""
+        """Replace the ground."""
         ...
 
     def close(self) -> None:
-        """Free what the world holds."""
+        """Free resources."""
         ...

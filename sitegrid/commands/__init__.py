@@ -1,12 +1,10 @@
 """Many machines draw one map of the ground together.
 
-The commands of `sitegrid`, one module each: `HELP`, `add_options(parser)` and `run(arguments)`, the exit code.
-
-A command module imports at its top only what the base install has. What needs an extra is imported inside a function,
-so that every command describes itself in any install, and `sitegrid --help` is quick.
+One module per command of `sitegrid`: `HELP`, `add_options(parser)`, and `run(arguments)`, the exit code. At its top it
+imports the base install only, extras inside functions: `--help` is quick and works in any install.
 """
 
-# In the order of `sitegrid --help`: each command once.
+# In the order of `sitegrid --help`, each command once.
 GROUPS = {
     "run a site": ("router", "server", "agent", "corrections", "web", "sim", "follow", "demo"),
     "ask": ("query", "calibrate", "trust", "distrust"),

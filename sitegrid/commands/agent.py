@@ -41,7 +41,7 @@ HELP = "run the localisation agent of one machine"
 EXTRA = "agent"
 KEPT = OutputFile(makes_folder=True)
 Show = Callable[[dict[str, Any]], None]
-LINK_S = 1.0  # how long to wait for the router before starting without it
+LINK_S = 1.0  # timeout for the router before starting without it
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -65,7 +65,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class _Joined:
-    """A machine that has joined the network under its name."""
+    """A machine in the network under its name."""
 
     session: zenoh.Session
     site: SiteConfig
@@ -115,7 +115,7 @@ def _corrections(joined: _Joined, driver: Driver) -> CorrectionsDelivery | None:
 
 
 def _open(settings: SessionConfig) -> zenoh.Session:
-    """Open a session; without a router one that goes on looking for it, so that the machine drives and records."""
+    """Open a session; without a router it keeps trying while the machine records."""
     try:
         return open_session(dataclasses.replace(settings, wait_s=LINK_S))
     except LinkError:
@@ -123,7 +123,7 @@ def _open(settings: SessionConfig) -> zenoh.Session:
 
 
 def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) -> Owner:
-    """Refuse to start while another agent of the same name runs."""
+    """Refuse to start beside an agent of the same name."""
     from agents.presence import find_namesake
     from protocol.wire.owners import this_process
 
@@ -134,7 +134,7 @@ def _claim_name(session: zenoh.Session, endpoint: str, site: str, machine: str) 
 
 
 def _calibration(arguments: Namespace) -> Path:
-    """The calibration lies beside the spool, if nothing else is asked for."""
+    """By default beside the spool."""
     return Path(arguments.calibration or arguments.spool.with_suffix(".calibration.json"))
 
 
@@ -159,7 +159,6 @@ def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig,
 
 
 def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Driver:
-    """What readings come from."""
     from agents.drivers.replay import Replay
     from agents.drivers.tables import open_sources
     from agents.drivers.zenoh import ZenohDriver
@@ -177,7 +176,7 @@ def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Dri
 
 @contextmanager
 def _shown(machine: str, site: str, is_stopped: Callable[[], bool], *, is_json: bool) -> Iterator[Show]:
-    """Say that it is ready, and how it does: on a terminal for people, else for programs."""
+    """Report readiness and status: for people on a terminal, else for programs."""
     if is_json or not sys.stderr.isatty():
         say_ready({"ready": "agent", "machine": machine, "site": site})
         due = Due()

@@ -1,4 +1,4 @@
-"""`sitegrid backup`: a copy of a store, also while its server writes."""
+"""`sitegrid backup`: copy a store, even while its server writes."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Copy once and print what the copy holds."""
+    """Copy once and print the copy's contents."""
     from sitegrid.backup import backup, lines
 
-    raise_interrupts()  # what is not complete is removed
+    raise_interrupts()  # incomplete output is removed
     examined = backup(arguments.store, arguments.out)
     say(asdict(examined)) if arguments.json else tell(*lines(arguments.out, examined))
     return 0

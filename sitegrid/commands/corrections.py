@@ -1,4 +1,4 @@
-"""`sitegrid corrections`: reads RTCM3 of a base, from its port or an NTRIP caster, for the receivers of a site."""
+"""`sitegrid corrections`: relay a base's RTCM3, from its port or an NTRIP caster, to a site's receivers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run(arguments: Namespace) -> int:
     site = load_site(arguments.site_file)
     joined = join(arguments.endpoint, arguments.keys, 30.0, role="corrections", name=config.name, site=site.name)
     with closing(open_session(joined)) as session:
-        key, drop = keys.corrections(site.name, config.name), zenoh.CongestionControl.DROP  # the next one replaces it
+        key, drop = keys.corrections(site.name, config.name), zenoh.CongestionControl.DROP  # superseded by the next one
         publisher = session.declare_publisher(key, congestion_control=drop)
         say({"ready": "corrections", "site": site.name, "name": config.name})
         report = Relay(publisher.put, config, site, stop.wait).run(stop)

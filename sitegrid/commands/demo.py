@@ -1,4 +1,4 @@
-"""`sitegrid demo`: the whole path on one host, every part its own process; ends with pictures and a proof."""
+"""`sitegrid demo`: the whole system on one host, a process per part; ends with pictures and an audit."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> int:
     """Run the demo."""
-    stop = stop_flag(None)  # it has children to end
+    stop = stop_flag(None)  # has children to stop
     with Display("Python starts", headless=arguments.headless or arguments.json) as display:
         from sitegrid.demo.run import run as run_demo  # takes some seconds
 

@@ -1,4 +1,4 @@
-"""`sitegrid doctor`: looks at this host's part of a site, says in one line each what is wrong, and what to do."""
+"""`sitegrid doctor`: check this host's part of a site; a line per problem, with advice."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import say, tell
 
 HELP = "check the set-up of this host and say how to repair it"
-EXTRA = "server"  # for --store alone
+EXTRA = "server"  # for --store only
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -28,7 +28,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Check what is given; 1 where something does not work."""
+    """Run the checks; 1 if anything fails."""
     findings = _findings(arguments)
     ok = all(finding.level != Level.FAIL for finding in findings)
     table = {"ok": ok, "findings": [asdict(finding) for finding in findings]}

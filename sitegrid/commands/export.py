@@ -1,4 +1,4 @@
-"""`sitegrid export`: the map as files that other programs read."""
+"""`sitegrid export`: the map as files for other programs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HELP = "write the map, roads or samples into a file for QGIS, CAD, notebooks or 
 EXTRA = "export"
 BESIDE = {"numba": "server", "prometheus_client": "server", "scipy": "server"}
 FORMS = (".tif", ".gpkg", ".geojson", ".fgb", ".parquet", ".csv", ".dxf", ".tum", ".html")
-OF_CELLS = ("as_of", "layers", "resolution")  # parameters of a region that are options here
+OF_CELLS = ("as_of", "layers", "resolution")  # region parameters that are options here
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Write one file, and say what it holds."""
+    """Write one file and report its contents."""
     from sitegrid.export.command import run as export
 
     return export(arguments)

@@ -1,4 +1,4 @@
-"""`sitegrid fold`: the samples of archives and stores, folded again with other parameters into a new store."""
+"""`sitegrid fold`: fold samples of archives and stores with other parameters into a new store."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def archive_place(word: str) -> Any:
-    """Parse a path or an address; what that takes is imported for this command alone."""
+    """Parse a path or address; its dependencies are for this command only."""
     from mapserver.journal.location import JournalLocation
     from mapserver.journal.places import place
 
@@ -44,7 +44,7 @@ def archive_place(word: str) -> Any:
 
 
 def run(arguments: Namespace) -> int:
-    """Fold once and print what became of the samples."""
+    """Fold once and print the outcome."""
     from sitegrid.refold.command import run as refold
 
     return refold(arguments)

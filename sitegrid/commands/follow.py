@@ -1,4 +1,4 @@
-"""`sitegrid follow`: a process that follows the journal of a site and answers queries of its map."""
+"""`sitegrid follow`: follow a site's journal and answer map queries."""
 
 from __future__ import annotations
 
@@ -70,5 +70,5 @@ def run(arguments: Namespace) -> int:
 
 
 def _host() -> str:
-    """The name of this host as one of a follower."""
+    """The host name as a follower's name."""
     return re.sub(r"[^a-z0-9_-]+", "-", socket.gethostname().lower()).strip("-_")[:63] or "follower"

@@ -1,4 +1,4 @@
-"""`sitegrid init`: makes the files of a site and a machine for the receivers that are plugged in."""
+"""`sitegrid init`: create site and machine files for the connected receivers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EXTRA = "receivers"
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Options of the command. What is not given is asked for on a terminal."""
+    """Options of the command; missing ones are asked for on a terminal."""
     add = parser.add_argument
     add("folder", type=Path, metavar="FOLDER", help="is made, where it is not there")
     ports = "where receivers are, as `sitegrid probe` has it (default: all serial ports)"
@@ -68,7 +68,7 @@ def run(arguments: Namespace) -> int:
 
 
 def parse_origin(text: str) -> tuple[float, ...]:
-    """Latitude, longitude [deg] and height [m] of an option or an answer."""
+    """Parse latitude, longitude [deg] and height [m]."""
     try:
         lat, lon, height = map(float, (text + ",0" if text.count(",") == 1 else text).split(","))
     except ValueError:
@@ -91,12 +91,12 @@ def _name(text: str) -> str:
 
 
 def _as_name(folder: Path) -> str:
-    """A name for the site, of that of its folder."""
+    """A valid site name from the folder's."""
     return re.sub("[^a-z0-9_-]+", "-", folder.absolute().name.lower()).strip("-_")[:63] or "site"
 
 
 def _answer(given: str | None, option: str, question: str, default: str, parse: Callable[[str], T]) -> T:
-    """What an option says, else who sits at the terminal, else the default; ConfigError where nobody does."""
+    """The option, else an answer from the terminal, else the default; ConfigError without a terminal."""
     if given is not None:
         return parse(given)
     if not (sys.stdin and sys.stdin.isatty()):
@@ -114,7 +114,7 @@ def _answer(given: str | None, option: str, question: str, default: str, parse: 
 
 
 def _receivers(arguments: Namespace) -> list[HeardLine]:
-    """What a driver reads, of all that is there; ConfigError where that is nothing, or not what was named."""
+    """Lines with a driver; ConfigError if there are none, or a named one has none."""
     from agents.drivers.transports import serial_ports
     from sitegrid.setup.hearing import NO_PORT
     from sitegrid.setup.listening import address_of, listen_to

@@ -1,4 +1,4 @@
-"""`sitegrid keys`: the certificates of a site, and the register of who is let in."""
+"""`sitegrid keys`: a site's certificates and name register."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HOST_LABEL = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Options of the command: those of each action."""
+    """Options of each action."""
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     init = add_action(actions, "init", "make the site's authority, and the keys of its router and map server")
     init.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
@@ -51,13 +51,13 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Make, revoke or list keys."""
+    """Create, revoke or list keys."""
     arguments.act(arguments, datetime.now(UTC).replace(microsecond=0))
     return 0
 
 
 def _init(arguments: Namespace, now: datetime) -> None:
-    """The authority, and the certificates of the router and the map server."""
+    """Create authority, router and map server certificates."""
     from sitegrid.security.key_folder import certify, make_folder
 
     folder, site = arguments.dir, check_name(arguments.site, "--site")
@@ -82,7 +82,7 @@ def _host(text: str) -> str:
 
 
 def _add(arguments: Namespace, now: datetime) -> None:
-    """A certificate for a new name, for one that was revoked, or with --renew for one that has it."""
+    """A certificate for a new or revoked name, or with --renew for an existing one."""
     from sitegrid.security.key_folder import AUTHORITY, certify
 
     folder, name = arguments.dir, check_name(arguments.name, "keys add")
@@ -102,7 +102,7 @@ def _add(arguments: Namespace, now: datetime) -> None:
 
 
 def _role(arguments: Namespace, known: RegisterEntry | None) -> str:
-    """As asked for; a renewed certificate keeps its role."""
+    """The requested role; a renewal keeps its role."""
     if known is None or known.revoked:
         return str(arguments.role or "machine")
     if arguments.role not in (None, known.role):
@@ -118,7 +118,7 @@ def _revoke(arguments: Namespace, _: datetime) -> None:
 
 
 def _token(arguments: Namespace, now: datetime) -> None:
-    """A new token in place of an older one of the same person; what is kept of it is a hash."""
+    """Replace a person's token; only a hash is stored."""
     folder, name = arguments.dir, check_name(arguments.name, "keys token")
     registers.load_register(folder)
     tokens = load_tokens(folder)

@@ -1,4 +1,4 @@
-"""`sitegrid log`: what of a recording of a machine is usable, and how well the machine is located in it."""
+"""`sitegrid log`: usability of a machine's recording, and accuracy of positions from it."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _add_options_of_run(run: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Check a log, replay it, or convert a recording."""
+    """Check, replay, or convert a recording."""
     if arguments.what == "convert":
         from sitegrid.convert.command import run as convert
 
@@ -68,7 +68,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _check(arguments: Namespace) -> int:
-    """Say what is usable; 1 where nothing can be run."""
+    """Report usability; 1 if nothing can run."""
     from sitegrid.logs.check import examine
 
     examined = examine(arguments.manifest, arguments.data)
@@ -88,7 +88,7 @@ def _run(arguments: Namespace) -> int:
 
     draw = None
     if arguments.picture:
-        from sitegrid.logs.picture import draw_log  # before the work: OpenCV may not be installed
+        from sitegrid.logs.picture import draw_log  # before the work: OpenCV may be missing
 
         draw = partial(draw_log, arguments.picture)
     named = {"filter": arguments.filter, "profile": arguments.profile, **dict(arguments.set)}

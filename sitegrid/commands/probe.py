@@ -1,4 +1,4 @@
-"""`sitegrid probe`: listens to ports and addresses, and says what talks there."""
+"""`sitegrid probe`: listen to ports and addresses, and report what is there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Listen and tell; 1 where nothing talks that a driver reads."""
+    """Listen and report; 1 if no driver can read anything."""
     from agents.drivers.transports import serial_ports
     from sitegrid.setup.hearing import NO_PORT, block, missing
     from sitegrid.setup.listening import address_of, listen_to

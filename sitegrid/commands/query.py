@@ -27,8 +27,8 @@ from sitegrid.process.progress import EVERY_S
 from sitegrid.whole_answers import Progress
 
 HELP = "ask the map"
-HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of a table for people, unless named
-# Words of a query that are no options: what stands for them in the usage, and their names or what each of many is.
+HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # default columns for people
+# Positional words per query: their name in the usage, and their parts.
 POSITION = ("x_m", "y_m")
 WORDS: dict[str, tuple[str, tuple[str, ...] | str]] = {
     "point": ("position, in metres", POSITION),
@@ -39,7 +39,7 @@ WORDS: dict[str, tuple[str, tuple[str, ...] | str]] = {
     "route": ("places of the line, in metres", "X_M Y_M"),
     "way": ("from a place to another, in metres", ("from_x_m", "from_y_m", "to_x_m", "to_y_m")),
 }
-PLACED = ("x", "y", "places", "bounds", "polygon", "line", "from", "to")  # parameters that these words give
+PLACED = ("x", "y", "places", "bounds", "polygon", "line", "from", "to")  # parameters from these words
 FOR_PROGRAMS = ("piece", "tiles", "lanes")
 FOLLOWERS = "followers that answer, and how far behind they are"
 
@@ -84,7 +84,7 @@ def _add_query(queries: Subparsers, cls: type[MapQuery[Any]]) -> None:
 
 
 def _add_common(parser: ArgumentParser, *, again: bool = False) -> None:
-    """Options of every query, before its name and after it."""
+    """Options before and after the query's name."""
     add_network(parser, again=again)
     add_site(parser, again=again)
     default = SUPPRESS if again else None
@@ -95,7 +95,7 @@ def _add_common(parser: ArgumentParser, *, again: bool = False) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Ask once and print the answer; changes, while they are followed, until stopped."""
+    """Query once and print the answer; with --follow until stopped."""
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         if getattr(arguments, "follow", False):
             _follow_changes(client, arguments)
@@ -106,7 +106,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _ask(cls: type[MapQuery[Any]], client: Client, arguments: Namespace) -> Answer:
-    """Ask the query that the options are of."""
+    """Send the query."""
     vars(arguments).update(_placed(cls, arguments, client))
     if cls is HistoryQuery and not arguments.asked_layers and not arguments.json:
         arguments.asked_layers = ",".join(HISTORY_LAYERS)
@@ -118,7 +118,7 @@ def _ask(cls: type[MapQuery[Any]], client: Client, arguments: Namespace) -> Answ
 
 
 def _placed(cls: type[MapQuery[Any]], arguments: Namespace, client: Client) -> dict[str, Any]:
-    """Parameters that words of a query are of."""
+    """Parameters from positional words."""
     if WORDS.get(cls.name, ("", ""))[1] == POSITION:
         if arguments.lat is not None and arguments.lon is not None:
             arguments.x_m, arguments.y_m = client.to_map(arguments.lat, arguments.lon)
@@ -133,7 +133,7 @@ def _placed(cls: type[MapQuery[Any]], arguments: Namespace, client: Client) -> d
 
 
 def _written(region: Region, out: Path, table: Any, lines: Iterable[str]) -> Answer:
-    """Write a region into a file, and say so."""
+    """Write a region to a file and report it."""
     arrays: dict[str, Any] = {"x_m": region.x_m, "y_m": region.y_m, **region.layers}
     with whole_file(out) as file:
         np.savez_compressed(file, **arrays)
@@ -141,7 +141,7 @@ def _written(region: Region, out: Path, table: Any, lines: Iterable[str]) -> Ans
 
 
 def _pieces_shown() -> Progress:
-    """What shows on standard error, now and then, how much of a large region is here."""
+    """Show a large region's progress on standard error."""
     next_s = time.monotonic() + EVERY_S
 
     def show(here: int, count: int) -> None:
@@ -154,7 +154,7 @@ def _pieces_shown() -> Progress:
 
 
 def _follow_changes(client: Client, arguments: Namespace) -> None:
-    """First what is known, then what is found; listens before it asks, so that none is missed in between."""
+    """Known changes, then new ones; listens first, so none is missed."""
     stop = stop_flag()
 
     def show(change: GroundChange) -> None:

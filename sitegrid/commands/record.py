@@ -1,4 +1,4 @@
-"""`sitegrid record`: what a running site says, as a file for Foxglove, Rerun and `sitegrid replay`."""
+"""`sitegrid record`: a running site's messages as a file for Foxglove, Rerun and `sitegrid replay`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Record until stopped, and say what the file holds."""
+    """Record until stopped and report the contents."""
     from protocol.errors import ConfigError
     from protocol.recording import Recording
     from sitegrid.client import connect
@@ -37,7 +37,7 @@ def run(arguments: Namespace) -> int:
 
     if unknown := set(arguments.what or ()) - set(WHAT):
         raise ConfigError("--what", f"{min(unknown)} is none of {', '.join(WHAT)}")
-    stop, samples = stop_flag(None), None  # the file is completed at the end
+    stop, samples = stop_flag(None), None  # completes the file at the end
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         client.site_info()
         if arguments.store:
@@ -53,7 +53,7 @@ def run(arguments: Namespace) -> int:
             recorder.run(lambda: stop.is_set() or time.monotonic() >= end_s)
             recording.finish()
         finally:
-            recording.abandon()  # without an error it is closed already
+            recording.abandon()  # already closed without an error
     counts, lost = recorder.counts(), recorder.lost + Counter(excluded=recording.excluded)
     holds, lacks = (", ".join(f"{count} {name}" for name, count in some.items()) for some in (counts, lost))
     table = {"recorded": str(arguments.file), "messages": counts, "lost": lost}

@@ -1,4 +1,4 @@
-"""`sitegrid replay`: recorded readings to agents, or recorded samples to a map server."""
+"""`sitegrid replay`: feed recorded readings to agents, or samples to a map server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sitegrid restore`: a store made of a backup."""
+"""`sitegrid restore`: make a store from a backup."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Restore once and print what the store holds."""
+    """Restore once and print the store's contents."""
     from sitegrid.backup import lines, restore
 
-    raise_interrupts()  # what is not complete is removed
+    raise_interrupts()  # incomplete output is removed
     examined = restore(arguments.backup, arguments.out)
     say(asdict(examined)) if arguments.json else tell(*lines(arguments.out, examined), *ADVICE)
     return 0

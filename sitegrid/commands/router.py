@@ -1,4 +1,4 @@
-"""`sitegrid router`: the site's router, which is a Zenoh session in router mode."""
+"""`sitegrid router`: the site's router, a Zenoh session in router mode."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _route_open(endpoint: str, stop: threading.Event, *, insecure: bool) -> None:
-    """Route without keys: whoever connects may do everything, so only this host may, unless --insecure is given."""
+    """Route without keys: everybody may do everything, hence this host only, unless --insecure."""
     on_this_host = is_loopback(endpoint)
     if not (on_this_host or insecure):
         advice = "pass --keys (`sitegrid keys init`), listen on tcp/127.0.0.1:7447, or say --insecure"
@@ -56,10 +56,9 @@ def _route_open(endpoint: str, stop: threading.Event, *, insecure: bool) -> None
 
 
 def _route_guarded(folder: Path, endpoint: str, stop: threading.Event) -> None:
-    """Route with keys. Zenoh reads its rules when a session opens, so a changed register needs a new session.
+    """Route with keys; a changed register needs a new session, because Zenoh reads rules on opening.
 
-    All links are cut for half a second then; those that are allowed connect again by themselves. A register that cannot
-    be read changes nothing.
+    All links break for half a second; permitted ones reconnect. An unreadable register changes nothing.
     """
     text, register = _text(folder), load_register(folder)
     session = open_session(_guarded(folder, endpoint, register))

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 HELP = "run the map server of a site"
 EXTRA = "server"
-FENCED = 3  # exit code of a server that another one took over from
+FENCED = 3  # exit code after another server took over
 
 
 class _StoppedError(Exception):
-    """A signal came while another server was waited for."""
+    """A signal came while waiting for another server."""
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -57,7 +57,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Serve until stopped; then finish what has come in, commit, snapshot."""
+    """Serve until stopped; then finish pending batches, commit, snapshot."""
     from mapserver.config import ServerConfig
     from mapserver.journal.location import JournalLocation
     from mapserver.server import Server, warm_up
@@ -106,22 +106,22 @@ def run(arguments: Namespace) -> int:
                 raise LinkError(arguments.endpoint, f"{server.ended}; this one ends")
             if server.fenced:
                 tell(f"sitegrid server: {location}: {server.fenced}; this one ends")
-                end_in_time(FENCED)  # its database may not answer
+                end_in_time(FENCED)  # its database may hang
                 return FENCED
     return 1 if server.failed else 0
 
 
 def _verifier(keys: Path | None) -> Verify | None:
-    """What checks signatures by the register in a folder of keys, as it is now."""
+    """Verifier with the register's current keys."""
     if keys is None:
         return None
-    from sitegrid.security.signing import Verifier  # only a server that asks for signatures needs `cryptography`
+    from sitegrid.security.signing import Verifier  # `cryptography` is needed with keys only
 
     return Verifier(load_register(keys).signing_keys()).check
 
 
 def _export(opened: ExitStack, session: zenoh.Session, server: Server, site: str, arguments: Namespace) -> str:
-    """Show metrics for as long as the server runs; returns where."""
+    """Serve metrics while the server runs; returns their address."""
     from mapserver.monitoring.exporter import Exporter
     from mapserver.monitoring.metrics import HealthListener, ServerCollector
 

@@ -1,4 +1,4 @@
-"""`sitegrid sim`: simulated machines publish the readings of their sensors."""
+"""`sitegrid sim`: publish simulated machines' sensor readings."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Publish, record, draw, or write the configurations that go with the simulation."""
+    """Publish, record, draw, or write the agents' configurations."""
     from sim.config import resolve
     from sim.publisher import run as publish
 
-    stop = stop_flag(None if arguments.record else END_S)  # a recording is written at its end, whole
+    stop = stop_flag(None if arguments.record else END_S)  # a recording is written at the end
     config = _config(arguments)
     if arguments.write_configs:
         from sim.config import write_configs
@@ -74,7 +74,7 @@ def run(arguments: Namespace) -> int:
         return 0
     settings = join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name)
     if arguments.ports:
-        settings = dataclasses.replace(settings, wait_s=-1)  # receivers speak before anybody asks a router for the rest
+        settings = dataclasses.replace(settings, wait_s=-1)  # receivers speak before anybody connects to a router
     tell = (lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None
     report = publish(config, settings, stop, on_progress=tell, truth_dir=arguments.truth, ports_dir=arguments.ports)
     true = f"; the truth is in {arguments.truth}" if arguments.truth else ""
@@ -97,7 +97,7 @@ def _record(config: SimConfig, arguments: Namespace, stop: threading.Event) -> i
 
 
 def _draw(config: SimConfig, arguments: Namespace) -> None:
-    from sim.pictures.picture import draw  # imported here: a run without pictures needs no renderer
+    from sim.pictures.picture import draw  # only pictures need the renderer
 
     pictures = [str(path) for path in draw(config, arguments.picture)]
     say({"pictures": pictures}) if arguments.json else note("\n".join(pictures))

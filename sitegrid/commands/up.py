@@ -1,4 +1,4 @@
-"""`sitegrid up`: router, map server, page and agent of one folder on this host, each its own process, until Ctrl-C."""
+"""`sitegrid up`: router, map server, page and agent of a folder, a process each, until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 HELP = "run router, map server, page and agent of a folder that `sitegrid init` has made, on this host"
 EXTRA = "receivers,server,web"
-READY_S = 300.0  # without a word, until a process counts as stuck; a first start compiles for a minute
+READY_S = 300.0  # silence after which a process counts as hung; a first start compiles for a minute
 COUNT = re.compile(r"\d+")
 
 
@@ -39,12 +39,12 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Run all until a signal comes, which is 0, or one of them ends by itself, which is 1."""
+    """Run everything; 0 after a signal, 1 if a process ends by itself."""
     from sitegrid.setup.files import Folder
 
     folder = Folder(arguments.folder)
     site, machine, _ = folder.load()
-    stop = stop_flag(None)  # it has children to end
+    stop = stop_flag(None)  # has children to stop
     folder.logs.mkdir(exist_ok=True)
 
     def meanwhile(line: dict[str, Any]) -> None:
@@ -71,7 +71,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _start(folder: Folder, site: str, children: Children) -> tuple[str, str, list[Child]]:
-    """Start every part; returns the router's endpoint, the page's address, and the processes."""
+    """Start all parts; returns router endpoint, page address, processes."""
     from sitegrid.setup.files import PAGE, ROUTER
 
     endpoint, page = DEFAULT_ENDPOINT, PAGE
@@ -98,7 +98,7 @@ def _start(folder: Folder, site: str, children: Children) -> tuple[str, str, lis
 
 
 def _ready(child: Child) -> dict[str, Any]:
-    """What a process says once it is ready; ProcessError with its own words where it ends instead."""
+    """A process's ready message; ProcessError with its own words if it ends."""
     try:
         return child.expect("ready", READY_S)
     except ProcessError:
@@ -108,7 +108,7 @@ def _ready(child: Child) -> dict[str, Any]:
 
 
 def _watch(running: list[Child], stop: threading.Event, show: Callable[[], None]) -> None:
-    """Wait for a signal; ProcessError where a process ends before, but an agent whose recording has ended."""
+    """Wait for a signal; ProcessError if a process ends first, except an agent at its recording's end."""
     while not stop.wait(0.25):
         show()
         for child in [child for child in running if child.code is not None]:
@@ -120,7 +120,7 @@ def _watch(running: list[Child], stop: threading.Event, show: Callable[[], None]
 
 
 class _Status:
-    """Shows what the agent's health says of itself: on a terminal in a line that changes, elsewhere each change."""
+    """Shows an agent's status: on a terminal in place, else every change."""
 
     def __init__(self, endpoint: str, site: str, machine: str, line: StatusLine | None) -> None:
         self._machine, self._line, self._shown = machine, line, ""
@@ -128,10 +128,10 @@ class _Status:
         self._health = self._session.declare_subscriber(keys.health(site, machine), zenoh.handlers.RingChannel(1))
 
     def show(self) -> None:
-        """Say what is new."""
+        """Show news."""
         if not (sample := self._health.try_recv()):
             return
-        with suppress(MessageError, KeyError, TypeError):  # of another version
+        with suppress(MessageError, KeyError, TypeError):  # other versions
             values = decode_health(sample.payload.to_bytes()).values
             if self._line:
                 self._line.show(line_of(self._machine, values))

@@ -1,4 +1,4 @@
-"""`sitegrid verify`: all of a store or a backup read and checked."""
+"""`sitegrid verify`: read and check a whole store or backup."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Read all and print what was looked through."""
+    """Verify and print the contents."""
     from sitegrid.backup import lines, verify
 
     examined = verify(arguments.store)

@@ -1,4 +1,4 @@
-"""`sitegrid web`: the live page and the map over HTTP, beside the map server."""
+"""`sitegrid web`: live page and map over HTTP."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Recordings of others become log folders: bags of ROS, bytes of receivers, GPX (docs/log-folders.md)."""
+"""Convert recordings to log folders: ROS bags, receiver bytes, GPX (docs/log-folders.md)."""

@@ -1,4 +1,4 @@
-"""One recording into one log folder: what feeds which sensor, what it holds, and all that somebody must know of it."""
+"""One recording into one log folder, with a report: sensors, contents, and what is left to do by hand."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from sitegrid.process.streams import table
 from sitegrid.times import iso
 
 Takes = Sequence[tuple[str, tuple[str, ...]]]
-NONE = "none"  # in place of a kind: nothing is taken of the topic
-NOT_STATED = 1.0  # stands for a variance, where the limits of a reading are looked at
+NONE = "none"  # kind that takes nothing of a topic
+NOT_STATED = 1.0  # variance for limit checks where none is stated
 BODY = "[machine]: mass, wheels and the like are those of a wheel loader of 17.5 t: write those of this machine"
 
 
@@ -38,7 +38,7 @@ BODY = "[machine]: mass, wheels and the like are those of a wheel loader of 17.5
 class Sensor:
     """One file of the log folder while it is written.
 
-    source: topic, with joints. rows: written; back: those older than one before; unstated: those without a variance.
+    source: topic, with joints. rows: written. back: stamped before an earlier row. unstated: without a variance.
     """
 
     topic: Topic
@@ -54,7 +54,7 @@ class Sensor:
     first_refused: dict[str, str] = field(default_factory=dict)
 
     def take(self, value: Value) -> bool:
-        """Whether a value is a reading; counted either way."""
+        """Whether a value is a reading; counts it either way."""
         named = list(zip(columns(self.kind), value.values, strict=not value.problem))
         try:
             if value.problem:
@@ -73,7 +73,7 @@ class Sensor:
         return True
 
     def row(self) -> dict[str, Any]:
-        """As a row of the report."""
+        """A row of the report."""
         seconds = (self.newest_ns - self.first_ns) * 1e-9
         rate_hz = round((self.rows - 1) / seconds, 2) if seconds > 0 else None
         taken = {"topic": one_line(self.source), "type": self.topic.type, "sensor": self.name, "kind": self.kind}
@@ -87,8 +87,8 @@ class Sensor:
 
 
 def run(arguments: Namespace) -> int:
-    """Convert, and say what was taken for what."""
-    raise_interrupts()  # what is not complete is removed
+    """Convert and report."""
+    raise_interrupts()  # incomplete output is removed
     folder = arguments.folder or Path(arguments.file.stem)
     report = convert(arguments.file, folder, arguments.take)
     if arguments.json:
@@ -103,9 +103,9 @@ def run(arguments: Namespace) -> int:
 
 
 def convert(file: Path, folder: Path, takes: Takes = ()) -> dict[str, Any]:
-    """Write a log folder of a recording; what was taken, left out, and is to be done by hand.
+    """Write a recording's log folder; returns what was taken, omitted, and left to do by hand.
 
-    takes: topics and the kinds that are taken of each. Raises ConfigError, LogFolderError; OSError of a disk.
+    takes: topics and the kinds taken of each. Raises ConfigError, LogFolderError, OSError.
     """
     if folder.exists():
         raise ConfigError(folder, "exists, and stays as it is: name another folder, or remove it")
@@ -132,12 +132,12 @@ def convert(file: Path, folder: Path, takes: Takes = ()) -> dict[str, Any]:
 
 
 def open_recording(file: Path) -> Recording:
-    """A recording, whatever it is; LogFolderError where it is none."""
+    """Open a recording of any type; LogFolderError if it is none."""
     is_folder = (file / "metadata.yaml").is_file()
     if not is_folder and not file.is_file():
         raise LogFolderError(file, "is neither a file nor the folder of a bag of ROS 2, with metadata.yaml")
     head = b"" if is_folder else _head(file)
-    if is_recording(file.name) and (file.suffix != ".log" or head.startswith(b"(")):  # receivers have .log, too
+    if is_recording(file.name) and (file.suffix != ".log" or head.startswith(b"(")):  # receivers use .log too
         return BusRecording(file)
     if head.startswith(MCAP) and b"ros2" not in head[:40]:
         raise LogFolderError(file, "is an MCAP file, but not of ROS 2")
@@ -154,7 +154,7 @@ def _head(file: Path) -> bytes:
 
 
 def choose(topics: Sequence[Topic], takes: Takes) -> tuple[list[Sensor], list[str]]:
-    """Sensors to write, and what is left out and why; ConfigError where somebody must choose first."""
+    """Sensors to write, and omitted topics with reasons; ConfigError if somebody must choose."""
     asked = [(topic, source, kind) for source, kinds in takes for topic, kind in _asked(topics, source, kinds)]
     named = {split_joints(source)[0] for source, _ in takes}
     chosen, left, open_questions = list(asked), list[str](), list[str]()
@@ -189,7 +189,7 @@ def _offer(topic: Topic, kind: str) -> str:
 
 
 def _asked(topics: Sequence[Topic], source: str, kinds: Sequence[str]) -> Iterator[tuple[Topic, str]]:
-    """What one --take asks for; ConfigError where there is no such thing."""
+    """Topics and kinds of one --take; ConfigError if there are none."""
     name, joints = split_joints(source)
     topic = next((topic for topic in topics if topic.name == name), None)
     if topic is None:
@@ -207,7 +207,7 @@ def _asked(topics: Sequence[Topic], source: str, kinds: Sequence[str]) -> Iterat
 
 
 def _write(recording: Recording, sensors: Sequence[Sensor], folder: Path) -> tuple[float, ...]:
-    """Write the files of all sensors; the first fix: latitude, longitude [deg], height [m]."""
+    """Write all sensors' files; returns the first fix: latitude, longitude [deg], height [m]."""
     by_source = {(sensor.source, sensor.kind): sensor for sensor in sensors}
     first: tuple[float, ...] = ()
     with log_files(folder, {sensor.name: sensor.kind for sensor in sensors}) as write:
@@ -227,12 +227,12 @@ def _site(name: str, fix: Sequence[float], file: Path) -> SiteConfig:
 
 
 def _name(folder: Path) -> str:
-    """A name for site, machine and log, of that of the folder."""
+    """A valid name for site, machine and log, from the folder's."""
     return re.sub("[^a-z0-9_-]+", "-", folder.absolute().name.lower()).strip("-_")[:63] or "recording"
 
 
 def _config(sensor: Sensor) -> tuple[SensorConfig, list[str]]:
-    """A sensor of the manifest; what it is made of, and what somebody has to do about it."""
+    """A sensor of the manifest, and notes on its source and what is left to do."""
     topic, kind = sensor.topic, sensor.kind
     lacks = {"steering": "wheelbase_m", **dict.fromkeys(BEFORE_THE_WHEELS, "powertrain")}.get(kind, "")
     is_useless = bool(lacks) or sensor.unstated == sensor.rows
@@ -254,7 +254,7 @@ def _config(sensor: Sensor) -> tuple[SensorConfig, list[str]]:
 
 
 def _refusals(sensor: Sensor) -> Iterator[str]:
-    """Messages that are no readings, by reason."""
+    """Refused messages by reason."""
     total = sensor.rows + sensor.refused.total()
     for reason, n in sensor.refused.items():
         yield f"{sensor.source} as {sensor.kind}: {n} of {total} ({reason}), the first: {sensor.first_refused[reason]}"

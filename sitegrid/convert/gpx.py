@@ -1,4 +1,4 @@
-"""Tracks of GPS devices and telephones: GPX 1.0 and 1.1."""
+"""Tracks of GPS devices and phones: GPX 1.0 and 1.1."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sitegrid.convert.recording import Topic, Value
 
 
 class GpxRecording:
-    """The points of all tracks of a file; routes and waypoints are no drive."""
+    """Points of all tracks; routes and waypoints were not driven."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -32,7 +32,7 @@ class GpxRecording:
 
 
 def _points(path: Path) -> Iterator[Element]:
-    """Track points, one at a time in memory."""
+    """Track points, one in memory at a time."""
     try:
         for _, element in iterparse(path):  # noqa: S314 - expat from 2.4.1 on stops entities that multiply
             name = element.tag.rpartition("}")[2]

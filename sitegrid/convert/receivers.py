@@ -1,4 +1,4 @@
-"""Bytes of receivers, NMEA and UBX, by the decoders of an agent's drivers."""
+"""Receiver bytes, NMEA and UBX, decoded by the agent's drivers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from protocol.machine.readings import columns
 from sitegrid.convert.recording import Topic, Value
 from sitegrid.setup.hearing import Ear
 
-PIECE = 65_536  # bytes read at once
-UNSTATED_STD = 1e3  # stands for a variance that is not stated, without which the decoders drop a value
+PIECE = 65_536  # bytes per read
+UNSTATED_STD = 1e3  # marks unstated variances: decoders drop values without one
 
 
 class ReceiverRecording:
-    """A file of a receiver's bytes. Where several of NMEA's talkers state positions, each has topics of its own."""
+    """A file of receiver bytes. If several NMEA talkers state positions, each has its own topics."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -36,7 +36,7 @@ class ReceiverRecording:
         self.unread = [f"{name}: only {heard.kind} is" for name in heard.messages if not name.startswith(heard.kind)]
 
     def values(self, wanted: Collection[tuple[str, str]]) -> Iterator[Value]:
-        """Values of streams. What lacks the time or is broken is counted in `unread`."""
+        """Values of streams; broken or timeless messages are counted in `unread`."""
         topics = {f"s{i}": topic for i, (topic, _) in enumerate(wanted)}
         line = Line(self._format, {topic: sensor_of(f"s{i}", kind) for i, (topic, kind) in enumerate(wanted)})
         for piece in _pieces(self._path):
@@ -60,13 +60,13 @@ class ReceiverRecording:
 
 
 def sensor_of(name: str, kind: str) -> SensorConfig:
-    """A sensor that takes values whether a variance is stated or not."""
+    """A sensor that takes values with or without variance."""
     is_stating = any(column.startswith("var_") for column in columns(kind))
     return SensorConfig(name, kind, std=dict.fromkeys(QUANTITIES[kind][-1:] if is_stating else (), UNSTATED_STD))
 
 
 def unstated(kind: str, values: tuple[float, ...]) -> tuple[float, ...]:
-    """Values of a kind, 0 for a variance that nothing stated."""
+    """Values of a kind; unstated variances become 0."""
     named = zip(columns(kind), values, strict=True)
     return tuple(0.0 if name.startswith("var_") and value == UNSTATED_STD**2 else value for name, value in named)
 

@@ -1,4 +1,4 @@
-"""What any recording is to the converter: topics that can feed sensors, and their values in the order recorded."""
+"""Interface of recordings: topics that can feed sensors, and their values in recorded order."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import NamedTuple, Protocol
 class Topic:
     """A stream of a recording.
 
-    kinds: of sensors that it can feed, and the fields with units that each takes. sure: those taken unless told
-    otherwise. question: why somebody must choose. joints: parts of it that `TOPIC[a,b]` names. frame: in which it
-    measures; empty where that is not stated. measures: as a sensor has it. note: what to know of it once it is taken.
+    kinds: sensor kinds it can feed, with the fields and units taken. sure: taken by default. question: why somebody
+    must choose. joints: parts for `TOPIC[a,b]`. frame: of the measurement; empty: not stated. measures: as of a sensor.
+    note: caveat if taken.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Topic:
 
 
 class Value(NamedTuple):
-    """One message as a kind of reading. values: its columns, 0 for a variance not stated; problem: why it is none."""
+    """One message as a kind of reading. values: its columns, unstated variances 0. problem: why it is no reading."""
 
     topic: str
     kind: str
@@ -38,10 +38,10 @@ class Value(NamedTuple):
 
 
 class Recording(Protocol):
-    """unread: what is not read, and why, a phrase each; complete once all values were."""
+    """unread: what is not read, and why, a phrase each; complete after all values."""
 
     topics: list[Topic]
     unread: list[str]
 
     def values(self, wanted: Collection[tuple[str, str]]) -> Iterator[Value]:
-        """Values of these topics as these kinds; raises LogFolderError where the recording is damaged."""
+        """Values of these (topic, kind) pairs; LogFolderError if the recording is damaged."""

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and 2, and MCAP files of ROS 2, read by rosbags, without a ROS."""
+"""Bags of ROS 1 and 2, and ROS 2 MCAP files, read by rosbags, without ROS."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WHOSE = "the wheels' speed, a receiver's, or a filter's"
 
 
 class RosRecording:
-    """A bag. Types are read by the definitions of ROS itself: those of a bag may be anything."""
+    """A bag. Types follow ROS' own definitions; a bag's may be anything."""
 
     def __init__(self, path: Path, *, is_ros1: bool) -> None:
         self._path, self._is_ros1 = path, is_ros1
@@ -27,7 +27,7 @@ class RosRecording:
         self.topics = list(self._guarded(self._survey()))
 
     def values(self, wanted: Collection[tuple[str, str]]) -> Iterator[Value]:
-        """Values of topics, and of joints as `TOPIC[joint,joint]`; where nobody stamps, by the recorder's clock."""
+        """Values of topics and of joints, `TOPIC[joint,joint]`; unstamped ones have the recorder's time."""
         return self._guarded(self._values(wanted))
 
     def _values(self, wanted: Collection[tuple[str, str]]) -> Iterator[Value]:
@@ -41,7 +41,7 @@ class RosRecording:
                         yield _value(name, kind, stamp_ns, partial(TYPES[c.msgtype][kind][1], message, joints))
 
     def _survey(self) -> Iterator[Topic]:
-        """Topics that can be taken; the others go to `unread`."""
+        """Usable topics; the others go to `unread`."""
         with self._opened() as bag:
             for c in {c.topic: c for c in bag.connections}.values():
                 if not self._is_known(c):
@@ -75,20 +75,20 @@ class RosRecording:
             yield reader
 
     def _messages(self, bag: Any, connections: Sequence[Any]) -> Iterator[tuple[Any, int, Any]]:
-        """Connection, the recorder's time [ns] and message; none of no connection, where rosbags has all."""
+        """Connection, recorder's time [ns], message. No connections give nothing, where rosbags would give all."""
         read = getattr(_types(self._is_ros1), "deserialize_ros1" if self._is_ros1 else "deserialize_cdr")
         for connection, recorded_ns, data in bag.messages(connections=connections) if connections else ():
             yield connection, recorded_ns, read(data, connection.msgtype)
 
     def _is_known(self, connection: Any) -> bool:
-        """Whether its type is one that is read, by the definition of ROS."""
+        """Whether the type is supported, by ROS' own definition."""
         if (name := connection.msgtype) not in TYPES:
             return False
         types = _types(self._is_ros1)
         return connection.digest in ("", types.generate_msgdef(name)[1] if self._is_ros1 else types.hash_rihs01(name))
 
     def _guarded(self, items: Iterable[T]) -> Iterator[T]:
-        """Items of rosbags, which raises whatever its parsing of damaged bytes meets."""
+        """Handle rosbags, which raises anything on damaged bytes."""
         try:
             yield from items
         except ModuleNotFoundError:
@@ -106,7 +106,7 @@ def _types(is_ros1: bool) -> Any:  # noqa: FBT001 - of a cache
 
 
 def split_joints(name: str) -> tuple[str, list[str]]:
-    """`/joints[left,right]` as topic and joints."""
+    """Split `/joints[left,right]` into topic and joints."""
     topic, bracket, joints = name.partition("[")
     return topic, joints.rstrip("]").split(",") if bracket else []
 
@@ -119,6 +119,6 @@ def _value(name: str, kind: str, stamp_ns: int, made: Callable[[], Values]) -> V
 
 
 def _stamp_ns(message: Any) -> int:
-    """The header's time; 0 where there is none, or nobody set it."""
+    """The header's time; 0 if missing or unset."""
     header = getattr(message, "header", None)
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec) if header else 0

@@ -1,4 +1,4 @@
-"""Messages of ROS into values of readings. Pure. Axes are those of REP 103, covariances those of REP 145."""
+"""ROS messages to values of readings. Pure. Axes by REP 103, covariances by REP 145."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 from protocol.machine.machine_config import SensorConfig
 
 Values = tuple[float, ...]
-TICKS_PER_RAD = SensorConfig.ticks_per_rev / math.tau  # of wheel angles written as ticks, which need not be whole
-NOT_MEASURED = -1.0  # first element of a covariance
+TICKS_PER_RAD = SensorConfig.ticks_per_rev / math.tau  # wheel angles as ticks, possibly fractional
+NOT_MEASURED = -1.0  # first element of an unknown covariance
 JOINT_STATE = "sensor_msgs/msg/JointState"
 MOST_JOINTS = {"encoder": 2, "articulation": 1, "steering": 1}
 
@@ -30,7 +30,7 @@ def _imu(message: Any, _: Sequence[str]) -> Values:
 
 
 def measures(message: Any) -> tuple[str, ...]:
-    """What an Imu measures, as a sensor's `measures` has it; empty: all, also of other messages."""
+    """`measures` of an Imu; empty: all, and for other messages."""
     covariances = {"rate": "angular_velocity_covariance", "force": "linear_acceleration_covariance"}
     known = [q for q, name in covariances.items() if getattr(message, name, (0.0,))[0] != NOT_MEASURED]
     return () if len(known) == len(covariances) else tuple(known)
@@ -54,7 +54,7 @@ def _velocity(message: Any, _: Sequence[str]) -> Values:
 
 
 def _twist(message: Any) -> tuple[Any, Sequence[float]]:
-    """The velocity itself, and its covariance (36,), 0 where the type has none."""
+    """The velocity, and its covariance (36,), 0 if the type has none."""
     covariance: Sequence[float] = (0.0,) * 36
     while hasattr(message, "twist"):
         covariance, message = getattr(message, "covariance", covariance), message.twist
@@ -62,7 +62,7 @@ def _twist(message: Any) -> tuple[Any, Sequence[float]]:
 
 
 def _variance(value: float) -> float:
-    """0 for what is not known; NaN and negative values are that, too."""
+    """0 for unknown: NaN and negative values too."""
     return float(value) if value > 0 else 0.0
 
 
@@ -83,7 +83,7 @@ _TWIST: _Takes = {
     "gps_velocity": ("twist linear.x east, linear.y north [m/s], covariance [m2/s2]", _velocity),
 }
 _TICKS = _joints("position", lambda angles: (angles[0] * TICKS_PER_RAD, angles[-1] * TICKS_PER_RAD))
-# By type and kind: the fields that are taken, and what makes values of a message and chosen joints; ValueError: none.
+# By type and kind: fields taken, and the conversion of a message and chosen joints; ValueError: no reading.
 TYPES: dict[str, _Takes] = {
     "sensor_msgs/msg/NavSatFix": {"gps": ("latitude, longitude [deg], altitude [m], position_covariance [m2]", _fix)},
     "sensor_msgs/msg/Imu": {

@@ -1,1 +1,1 @@
-"""The demo: router, map server, simulator and agents on one host, each its own process."""
+"""The demo: router, map server, simulator and agents on one host, a process each."""

@@ -1,4 +1,4 @@
-"""What the demo runs, where its files lie, and its processes, each its own `sitegrid` command."""
+"""The demo's plan: what runs, its files, and its processes, a `sitegrid` command each."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from sitegrid.pictures.draw import TrackRecorder, draw
 from sitegrid.process.children import Child, Children, wait_until
 from sitegrid.proof.delivery import audit_store
 
-READY_S = 120.0  # without a word, until a process counts as stuck
+READY_S = 120.0  # silence after which a process counts as hung
 LOG_SPEED = 20.0  # times real time
-SIM_OPTIONS = ("scenario", "world", "machines", "seed", "seconds", "speed")  # those that the demo passes on
+SIM_OPTIONS = ("scenario", "world", "machines", "seed", "seconds", "speed")  # passed on by the demo
 
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """One demo. out, work: folders of pictures and of all else. configs: a file per machine. log: replayed beside."""
+    """One demo. out, work: folders of pictures, of all else. configs: a file per machine. log: replayed too."""
 
     out: Path
     work: Path
@@ -44,17 +44,17 @@ class DemoPlan:
 
     @property
     def truth(self) -> Path:
-        """The folder of the simulation's true map and tracks."""
+        """Folder of the true map and tracks."""
         return self.work / "truth"
 
     @property
     def true_map(self) -> Path:
-        """The true map of the simulation."""
+        """The simulation's true map."""
         return self.truth / "truth_map.npz"
 
 
 def make_plan(arguments: Namespace) -> DemoPlan:
-    """The plan of the options; clears the folder of an earlier run and writes the machines' configurations."""
+    """Plan from options; clears an earlier run's folder and writes the machines' configurations."""
     try:
         config = SimConfig(**{name: getattr(arguments, name) for name in SIM_OPTIONS})
     except ValueError as error:
@@ -68,7 +68,7 @@ def make_plan(arguments: Namespace) -> DemoPlan:
 
 
 def _emptied(work: Path) -> Path:
-    """The folder of an earlier run without its contents; ConfigError where it is something else's."""
+    """Empty an earlier run's folder; ConfigError if it is anything else."""
     if work.exists() and any(work.iterdir()) and not (work / "site.toml").exists():
         raise ConfigError(work, "is not of an earlier demo, and would be emptied; choose another --out")
     shutil.rmtree(work, ignore_errors=True)
@@ -77,14 +77,14 @@ def _emptied(work: Path) -> Path:
 
 
 def start_server(plan: DemoPlan, children: Children, name: str, site_file: Path) -> Child:
-    """A map server, which is ready some seconds later."""
+    """Start a map server; it is ready some seconds later."""
     store = plan.work / ("store" if name == "server" else f"store-{name}")
     words = ("server", "--endpoint", plan.endpoint, "--site-file", site_file, "--store", store)
     return children.start(name, *words)
 
 
 def start_agent(plan: DemoPlan, children: Children, config: Path) -> Child:
-    """The agent of one machine of the simulation."""
+    """Start one simulated machine's agent."""
     name = config.stem
     files = ("--spool", plan.work / f"{name}.db", "--audit", plan.work / f"{name}.audit")
     base = ("agent", "--endpoint", plan.endpoint, "--site-file", plan.site_file, "--config", config)
@@ -92,20 +92,20 @@ def start_agent(plan: DemoPlan, children: Children, config: Path) -> Child:
 
 
 def start_web(plan: DemoPlan, children: Children) -> str:
-    """The live page; returns its address."""
+    """Start the live page; returns its address."""
     words = ("web", "--endpoint", plan.endpoint, "--site", plan.scenario.site.name, "--listen", "0")
     return str(children.start("web", *words).expect("ready", READY_S)["url"])
 
 
 def start_sim(plan: DemoPlan, children: Children) -> Child:
-    """The simulator."""
+    """Start the simulator."""
     options = {name: getattr(plan.config, name) for name in SIM_OPTIONS}
     words = [word for name, value in options.items() if value is not None for word in (f"--{name}", value)]
     return children.start("sim", "sim", "--endpoint", plan.endpoint, *words, "--truth", plan.truth, "--json")
 
 
 class LogReplay:
-    """A real log, replayed by an agent of its own into a site with a map server of its own."""
+    """A real log, replayed by its own agent, site and map server."""
 
     def __init__(self, plan: DemoPlan, log: LogFolder, children: Children) -> None:
         assert plan.manifest is not None

@@ -1,4 +1,4 @@
-"""The run of the demo: start every part, wait for the end, audit the samples, draw the pictures."""
+"""The demo's run: start everything, wait for the end, audit samples, draw pictures."""
 
 from __future__ import annotations
 
@@ -68,12 +68,11 @@ def run(arguments: Namespace, stop: threading.Event, display: Display) -> int:
 
 
 def stays(arguments: Namespace) -> bool:
-    """Whether the page stays in the end: where it is asked for, and on a terminal, which has a Ctrl-C."""
+    """Whether the page stays open at the end: on request, or on a terminal, which has Ctrl-C."""
     return arguments.stay or (arguments.web and not arguments.json and sys.stderr.isatty())
 
 
 def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: Display) -> dict[str, Any]:
-    """Start everything, wait for the end, judge and draw."""
     display.begin("server starts")
     server = start_server(plan, children, "server", plan.site_file)
     agents = {path.stem: start_agent(plan, children, path) for path in plan.configs}
@@ -88,7 +87,7 @@ def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: D
         display.begin("pictures are drawn, and every sample is accounted for")
         for child in agents.values():
             child.expect("ended", READY_S)
-        client.calibrate(wait_s=MAX_WAIT_S)  # with the last samples too, and the map that we read has it
+        client.calibrate(wait_s=MAX_WAIT_S)  # include the last samples
         region, pictures = _draw(plan, client, tracks)
         rmse_m = position_rmse(tracks.poses(), plan.truth)
         tracks.close()
@@ -111,7 +110,7 @@ def _watch(
     children: tuple[Child, dict[str, Child]],
     control: tuple[threading.Event, Display],
 ) -> None:
-    """Show progress and redraw the map until the machines have driven; KeyboardInterrupt if stopped."""
+    """Show progress and redraw the map until the machines stop; KeyboardInterrupt if stopped."""
     (sim, agents), (stop, display) = children, control
     simulated_s, next_picture_s = 0.0, time.monotonic() + 3
     display.begin("machines drive")
@@ -131,7 +130,7 @@ def _watch(
 def _what(client: Client) -> str:
     try:
         info = client.info()
-    except (LinkError, QueryError):  # shown again in a moment
+    except (LinkError, QueryError):  # shown again shortly
         return "the map server is away"
     return f"{info.samples_merged} samples, {info.cells} cells" if info.samples_merged else SAMPLES_FOLLOW
 
@@ -164,7 +163,7 @@ def _report(
     pictures: list[str],
     log: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """The report as a table. rmse_m: position error of each machine. log: the report of the replayed log."""
+    """The report as a table. rmse_m: position error by machine. log: the replayed log's report."""
     whole, driven = scores
     log_lost, log_double = (log["lost"], log["double"]) if log else (0, 0)
     return {

@@ -1,4 +1,4 @@
-"""What is wrong with this host's part of a site: for each topic what is looked at, and what that means.
+"""Diagnosis of this host's part of a site.
 
 Functions that look (`open_`, `ask_`, `read_`) change nothing; functions that judge (`check_`) are pure.
 """
@@ -10,7 +10,7 @@ from enum import StrEnum
 
 
 class Level(StrEnum):
-    """PASS: as it should be. WARN: works, not for long or not well. FAIL: does not work. SKIP: was not looked at."""
+    """PASS: fine. WARN: works, but not for long or not well. FAIL: does not work. SKIP: not checked."""
 
     PASS = "PASS"  # noqa: S105 - no password
     WARN = "WARN"
@@ -20,7 +20,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One line: what was checked, the result, and what to do about it."""
+    """Result of one check, and advice."""
 
     level: Level
     check: str
@@ -32,5 +32,5 @@ class Finding:
 
 
 def skipped(check: str, reason: str) -> Finding:
-    """What was not looked at, and why."""
+    """A check that was not made."""
     return Finding(Level.SKIP, check, f"not checked: {reason}")

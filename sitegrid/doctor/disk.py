@@ -1,4 +1,4 @@
-"""Files and disks of this host: an agent's spool, a map server's store, and the space to write them."""
+"""Files and disks of this host: spool, store, free space."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from sitegrid.doctor import Finding, Level
 from sitegrid.health import problems_of, status_of, table_of
 
 FREE_FAIL, FREE_WARN = 64 * 2**20, 2**30
-WAITING_S = 3600.0  # samples that are older have not been taken for long
-TAIL_ROWS = 20_000  # journal rows that a restart folds in some seconds
+WAITING_S = 3600.0  # age of samples that nobody has taken for long
+TAIL_ROWS = 20_000  # journal rows that a restart folds in seconds
 
 
 def free_bytes(path: Path) -> int:
-    """Free space for a file or folder that may not be there yet."""
+    """Free space for a file or folder that need not exist."""
     place = path.absolute()
     while not place.is_dir():
         place = place.parent
@@ -36,7 +36,7 @@ def free_bytes(path: Path) -> int:
 
 
 def check_disk(what: str, free: int) -> Finding:
-    """Free space where a file grows [bytes]."""
+    """Free space [bytes] where a file grows."""
     message = f"{free / 2**30:.1f} GiB are free"
     if free < FREE_FAIL:
         return Finding(Level.FAIL, f"{what} disk", message, "make room now: soon nothing more can be written")
@@ -46,14 +46,14 @@ def check_disk(what: str, free: int) -> Finding:
 
 
 class InUseError(StoreError):
-    """An agent has the spool open."""
+    """The spool is open in an agent."""
 
 
 @dataclass(frozen=True)
 class SpoolState:
-    """A spool at rest. gone: samples that its disk has lost. oldest_ns: stamp of the oldest sample, 0 for none.
+    """A spool at rest. gone: samples lost by its disk. oldest_ns: oldest sample's stamp, 0: none.
 
-    damage: what is wrong with its write-ahead log, empty where nothing is.
+    damage: of its write-ahead log, empty: none.
     """
 
     depth: int
@@ -65,7 +65,7 @@ class SpoolState:
 
 
 def read_spool(path: Path) -> SpoolState:
-    """The state of a spool at rest; StoreError where it cannot be used, InUseError while an agent runs on it."""
+    """State of a spool at rest; StoreError if unusable, InUseError while an agent runs on it."""
     if not path.is_file():
         raise StoreError(path, "no such file; an agent makes it when it starts")
     traces = look_beside(path)
@@ -79,7 +79,7 @@ def read_spool(path: Path) -> SpoolState:
 
 
 def _read_only(path: Path) -> str:
-    """A URI that writes nothing. A spool at rest has no write-ahead log: it is read without files beside it."""
+    """URI that writes nothing: without a write-ahead log no files are made beside a spool."""
     log = path.with_name(f"{path.name}-wal")
     at_rest = not log.exists() or log.stat().st_size == 0
     return f"{path.absolute().as_uri()}?mode=ro" + ("&immutable=1" if at_rest else "")
@@ -99,7 +99,7 @@ def _spool_state(path: Path, db: sqlite3.Connection, traces: Traces) -> SpoolSta
 
 
 def check_spool(state: SpoolState, now_ns: int) -> Finding:
-    """Depth, age of the oldest, and what will never reach the server."""
+    """Depth, oldest age, and permanent losses."""
     age_s = (now_ns - state.oldest_ns) * 1e-9 if state.oldest_ns else 0.0
     message = f"{state.depth} samples wait" + (f", the oldest is of {_ago(age_s)}" if state.oldest_ns else "")
     message += f"; {state.dropped} were dropped, {state.quarantined} quarantined"
@@ -117,7 +117,7 @@ def check_spool(state: SpoolState, now_ns: int) -> Finding:
 
 
 def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
-    """A running agent, by the values of its health report: of another version, they may be anything."""
+    """A running agent, by its health report; other versions may send any values."""
     spool, status = table_of(values, "spool"), status_of(values)
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
     waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
@@ -131,11 +131,10 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
 
 @dataclass(frozen=True)
 class StoreState:
-    """A store. snapshot_row, snapshot_age_s: of the newest snapshot, 0 and infinity where there is none.
+    """A store. snapshot_row, snapshot_age_s: of the newest snapshot; 0 and infinity without one.
 
-    shortfall: what its files lack now of what was acknowledged, one line, empty where nothing is missing. missing: what
-    earlier starts found so, by machine.
-    checkpoints, damaged_checkpoints: how many; checkpoint_bytes: of all.
+    shortfall: acknowledged samples now missing in its files, one line, or empty. missing: those found by earlier
+    starts, by machine. checkpoint_bytes: of all checkpoints.
     """
 
     site: str
@@ -151,15 +150,15 @@ class StoreState:
     checkpoints: int = 0
     checkpoint_bytes: int = 0
     damaged_checkpoints: int = 0
-    replica: str = ""  # of a journal in PostgreSQL
+    replica: str = ""  # of a PostgreSQL journal
 
 
 def read_store(folder: Path, now_s: float, url: str = "") -> StoreState:
-    """The state of a store, also while a server uses it; StoreError where it cannot be used.
+    """State of a store, even in use; StoreError if unusable.
 
     url: of its journal in PostgreSQL.
     """
-    # imported here: needs the `server` extra, which a machine's host does not have
+    # needs the `server` extra, missing on a machine's host
     from mapserver.ingest.map_info import lacking
     from mapserver.journal import shortfall as short
     from mapserver.journal.location import JOURNAL_FILE, JournalLocation
@@ -215,7 +214,6 @@ def check_store(state: StoreState, site: SiteConfig | None) -> Finding:
 
 
 def _ago(age_s: float) -> str:
-    """An age as people read it."""
     if age_s < 0:
         return f"{-age_s:.0f} s from now"
     for unit, s in (("d", 86_400), ("h", 3600), ("min", 60)):

@@ -1,6 +1,6 @@
-"""The examination of this host's part of a site: what is looked at, in which order, as far as options name it.
+"""Examination of this host's part of a site, in order, as far as options name it.
 
-Positions are examined by a running agent's own health: what its fixes confirm, refute, or cannot show.
+Positions are judged by a running agent's health: what fixes confirm, refute, or cannot show.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from sitegrid.doctor.keys import check_certificate, read_certificate
 from sitegrid.follower_choice import Asker, is_answered
 from sitegrid.security.join import join
 
-ANYBODY = "doctor"  # where there are no keys, every name is as good
-ASKS_MAP = ("machine", "visitor", "admin")  # roles that may ask the map (docs/security.md)
-# Checks that need the map server:
+ANYBODY = "doctor"  # any name serves without keys
+ASKS_MAP = ("machine", "visitor", "admin")  # roles that may query the map (docs/security.md)
+# Checks that need the map server.
 OF_SERVER = ("server", "losses", "clock", "time", "writer", "followers", "version", "machines", "permission")
 REFUTED = "fixes are further off than the filter expects: look at the variance that the receiver states, and at mounts"
-MISSTATED = 2.25  # variance over the stated one: half as far again, more than chance makes of it
+MISSTATED = 2.25  # actual over stated variance: errors 1.5 times as large, beyond chance
 UNSEEN = "a slow GPS error that is larger than stated would not show: there is one receiver, or several that err alike"
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What is examined, as far as it is known. machine: empty where these keys send no samples."""
+    """The subject, as far as known. machine: empty if these keys send no samples."""
 
     options: Namespace
     site: str
@@ -68,7 +68,7 @@ def _subject(arguments: Namespace, identity: Identity | None) -> Subject:
 
 
 def _keys(arguments: Namespace) -> tuple[list[Finding], Subject | None]:
-    """Findings on the keys; with usable ones, also what else is to be examined."""
+    """Findings on the keys; if usable, also the subject of the other checks."""
     if arguments.keys is None:
         return [skipped("certificate", "give --keys FOLDER, if the site has keys")], _subject(arguments, None)
     try:
@@ -143,7 +143,7 @@ def _spool(subject: Subject, session: zenoh.Session | None) -> list[Finding]:
 
 
 def _spool_itself(subject: Subject, path: Path, session: zenoh.Session | None) -> list[Finding]:
-    """The file; while an agent has it open, the agent's health report, which has its positions too."""
+    """The file; if an agent has it open, its health report, with its positions."""
     try:
         return [disk.check_spool(disk.read_spool(path), time.time_ns())]
     except disk.InUseError:
@@ -167,7 +167,7 @@ def _store(folder: Path | None, journal: str, site: SiteConfig | None) -> list[F
 
 
 def check_positions(machine: str, values: Mapping[str, Any]) -> Finding:
-    """The verdicts on an agent's receivers, by the values of its health report: they may be anything."""
+    """Verdicts on an agent's receivers, from its health report of any content."""
     pipeline = values.get("pipeline")
     shown = pipeline.get("consistency") if isinstance(pipeline, Mapping) else None
     receivers = {
@@ -188,7 +188,7 @@ def check_positions(machine: str, values: Mapping[str, Any]) -> Finding:
 
 
 def _misstated(receiver: str, consistency: Mapping[str, Any]) -> str:
-    """How far off what a receiver states of its error is; empty where it is about right."""
+    """How a receiver misstates its error; empty if about right."""
     factor = consistency.get("variance_factor")
     if not isinstance(factor, int | float) or not factor > 0 or 1 / MISSTATED < factor < MISSTATED:
         return ""

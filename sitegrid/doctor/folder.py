@@ -1,4 +1,4 @@
-"""A folder of `sitegrid init`: its files, ports, place and data, looked at without starting anything."""
+"""A folder of `sitegrid init`: files, ports, place and data, checked without starting anything."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from sitegrid.setup.files import PORTS, Folder
 from sitegrid.setup.hearing import HeardLine
 from sitegrid.setup.listening import listen_to
 
-LISTEN_S = 2.5  # receivers send each second
-FAR_M = 5000.0  # of an origin: it works, and few sites are so large
+LISTEN_S = 2.5  # receivers send every second
+FAR_M = 5000.0  # beyond it from the origin: works, but few sites are that large
 UNFED = "nothing feeds it: name it in `feeds` of a [[driver]], or say `use = false`"
 
 
 def examine_folder(path: Path) -> list[Finding]:
-    """Check what the folder has; what depends on a file that cannot be read is left out."""
+    """Check a folder's contents; parts that need an unreadable file are skipped."""
     folder = Folder(path)
     try:
         site, machine, config = folder.load()
@@ -62,7 +62,7 @@ def _spool(folder: Folder) -> tuple[Finding, bool]:
 
 
 def _receivers(site: SiteConfig, config: AgentConfig) -> list[Finding]:
-    """What the ports of the drivers say, and those that take corrections alone."""
+    """Ports of drivers, and ports for corrections only."""
     drivers = [driver for driver in config.driver if driver.kind in DECODERS]
     heard = listen_to([driver.address for driver in drivers], LISTEN_S)
     findings = [check_receiver(driver, at_port) for driver, at_port in zip(drivers, heard, strict=True)]
@@ -76,7 +76,7 @@ def _receivers(site: SiteConfig, config: AgentConfig) -> list[Finding]:
 
 
 def check_sensors(machine: MachineConfig, config: AgentConfig) -> list[Finding]:
-    """Whether each sensor is fed, and sits where one can."""
+    """Whether each sensor is fed and plausibly mounted."""
     fed = {name for driver in config.driver for name in driver.feeds.values()}
     are_ours = bool(config.driver) and all(driver.kind in DECODERS for driver in config.driver)
     findings = []
@@ -90,7 +90,7 @@ def check_sensors(machine: MachineConfig, config: AgentConfig) -> list[Finding]:
 
 
 def check_receiver(driver: DriverConfig, heard: HeardLine) -> Finding:
-    """Whether what was heard at the port of a driver is what its table says."""
+    """Whether the bytes at a driver's port fit its table."""
     where = f"{driver.address}: "
     if heard.kind and heard.kind != driver.kind:
         advice = f'say `kind = "{heard.kind}"`, or set it to send {driver.kind.upper()}'
@@ -108,7 +108,7 @@ def check_receiver(driver: DriverConfig, heard: HeardLine) -> Finding:
 
 
 def check_origin(site: SiteConfig, place: tuple[float, ...]) -> Finding:
-    """Whether a receiver's place is near the site's origin."""
+    """Whether a receiver is near the site's origin."""
     lat_deg, lon_deg, height_m = place
     x_m, y_m, _ = Projection(site).to_map(lat_deg, lon_deg, height_m)
     away_m = max(abs(x_m), abs(y_m))
@@ -128,6 +128,5 @@ def check_ports(taken: list[str]) -> Finding:
 
 
 def _fix_of(heard: HeardLine) -> str:
-    """What comes there, in a few words."""
     fix = f"; {heard.quality}, {heard.satellites} satellites" if heard.place else ""
     return f"{heard.kind} feeds {', '.join(heard.streams)}{fix}"

@@ -1,4 +1,4 @@
-"""The keys of this process: validity, name and chain of their certificate."""
+"""Keys of a process: validity, name and chain of the certificate."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EXPIRES_DAYS = 30
 
 @dataclass(frozen=True)
 class Certificate:
-    """common_name: as it says. signed: by the authority beside it. fits: to the private key. mode: of the key file."""
+    """common_name: as stated. signed: by the authority beside it. fits: the private key. mode: of the key file."""
 
     identity: Identity
     common_name: str
@@ -29,8 +29,8 @@ class Certificate:
 
 
 def read_certificate(folder: Path) -> Certificate:
-    """What a folder of keys holds; ConfigError where something is missing or cannot be read."""
-    from cryptography import x509  # imported here: needs the `security` extra
+    """Read a folder of keys; ConfigError if anything is missing or unreadable."""
+    from cryptography import x509  # needs the `security` extra
     from cryptography.exceptions import InvalidSignature
     from cryptography.x509.oid import NameOID
 
@@ -41,7 +41,7 @@ def read_certificate(folder: Path) -> Certificate:
         )
         names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
         mode = (folder / KEY_FILE).stat().st_mode
-        with suppress(ssl.SSLError):  # OpenSSL compares key and certificate when it loads both
+        with suppress(ssl.SSLError):  # OpenSSL compares key and certificate on loading
             ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(folder / CERTIFICATE_FILE, folder / KEY_FILE)
             fits = True
     except OSError as error:
@@ -56,7 +56,7 @@ def read_certificate(folder: Path) -> Certificate:
 
 
 def check_certificate(certificate: Certificate, now: datetime, site: str = "", machine: str = "") -> list[Finding]:
-    """Validity, name and chain of a certificate. site, machine: what it is needed for, where that is known."""
+    """Validity, name and chain of a certificate. site, machine: its purpose, if known."""
     who = f"{certificate.identity.role} {certificate.identity.name} of site {certificate.identity.site}"
     return [_validity(certificate, now, who), _name(certificate, site, machine, who), _chain(certificate)]
 
@@ -77,7 +77,7 @@ def _validity(certificate: Certificate, now: datetime, who: str) -> Finding:
 
 def _name(certificate: Certificate, site: str, machine: str, who: str) -> Finding:
     identity = certificate.identity
-    name, _, issue = certificate.common_name.partition(".")  # a name that came back is numbered (register.common_name)
+    name, _, issue = certificate.common_name.partition(".")  # re-added names are numbered (register.common_name)
     if name != identity.name or not (issue.isdecimal() or not issue):
         problem = f"identity.toml says {identity.name}, the certificate {certificate.common_name}"
         return Finding(Level.FAIL, "name", problem, "the files are of two folders: copy the whole folder again")

@@ -1,6 +1,6 @@
-"""The network as this host sees it: router, map server, clocks, versions, and the right to send samples.
+"""The network from this host: router, map server, clocks, versions, permission to send samples.
 
-A denial is silent in Zenoh, so a check without an answer says what the silence may mean.
+Zenoh denies silently, so a check without an answer says what the silence may mean.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from sitegrid.trust_sentences import rolls
 
 ANSWER_S = 5.0
 LINK_S = 3.0
-HEALTH_S = 3.0  # an agent reports its health every second
-AHEAD_S = 60.0  # of the newest stamp and the server's clock: more than clocks set by hand are off
-OFFSET_S = 1.0  # of two clocks, beyond which the ages on the map are off
+HEALTH_S = 3.0  # an agent reports every second
+AHEAD_S = 60.0  # newest stamp ahead of the server's clock: beyond the error of clocks set by hand
+OFFSET_S = 1.0  # clock offset beyond which the map's ages are wrong
 
 
 # --- router ----------------------------------------------------------------------------------------------------------
@@ -45,7 +45,7 @@ OFFSET_S = 1.0  # of two clocks, beyond which the ages on the map are off
 
 @dataclass(frozen=True)
 class RouterLink:
-    """The way to the router. took_s: to open a session, None if there is none. listens: somebody takes connections."""
+    """Link to the router. took_s: to open a session, None: failed. listens: something accepts connections."""
 
     endpoint: str
     took_s: float | None
@@ -54,9 +54,9 @@ class RouterLink:
 
 
 def open_link(config: SessionConfig) -> tuple[RouterLink, zenoh.Session | None]:
-    """Open a session, and tell how that went."""
+    """Open a session and describe the result."""
     has_keys = config.credentials is not None
-    if not _listens(config.endpoint):  # else Zenoh tries until the time is up
+    if not _listens(config.endpoint):  # else Zenoh retries until the timeout
         return RouterLink(config.endpoint, None, has_keys=has_keys), None
     start_s = time.perf_counter()
     try:
@@ -67,7 +67,7 @@ def open_link(config: SessionConfig) -> tuple[RouterLink, zenoh.Session | None]:
 
 
 def _listens(endpoint: str) -> bool:
-    """Whether somebody takes TCP connections at an endpoint."""
+    """Whether an endpoint accepts TCP connections."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     try:
         socket.create_connection((host.strip("[]"), int(port)), LINK_S).close()
@@ -77,7 +77,7 @@ def _listens(endpoint: str) -> bool:
 
 
 def check_link(link: RouterLink) -> Finding:
-    """Whether a session with the router could be opened."""
+    """Whether a session with the router opened."""
     if link.took_s is not None:
         return Finding(Level.PASS, "router", f"{link.endpoint} answers in {link.took_s * 1e3:.0f} ms")
     if not link.listens:
@@ -92,9 +92,9 @@ def check_link(link: RouterLink) -> Finding:
 
 
 def ask_info(session: zenoh.Session, site: str) -> tuple[MapInfo | None, tuple[int, int]]:
-    """The server's `info`, None without an answer, and this host's clock before and after [ns].
+    """The server's `info`, None without an answer; and this host's clock before and after [ns].
 
-    MessageError where the answer cannot be read.
+    MessageError if the answer is unreadable.
     """
     before_ns = time.time_ns()
     data = _ask(session, keys.map_query(site, "info"), b"")
@@ -103,7 +103,7 @@ def ask_info(session: zenoh.Session, site: str) -> tuple[MapInfo | None, tuple[i
 
 
 def ask_writers(session: zenoh.Session, site: str) -> list[MapInfo]:
-    """The `info` of every map server of a site; without those whose answers cannot be read."""
+    """Readable `info` of every map server of a site."""
     every: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
     servers = []
     for reply in session.get(keys.map_query(site, "info"), timeout=ANSWER_S, **every):
@@ -113,7 +113,7 @@ def ask_writers(session: zenoh.Session, site: str) -> list[MapInfo]:
 
 
 def ask_machines(session: zenoh.Session, site: str) -> tuple[MachineState, ...]:
-    """What the server knows of machines; nothing without an answer that can be read."""
+    """The server's view of the machines; empty without a readable answer."""
     data = _ask(session, keys.map_query(site, "machines"), b"")
     with suppress(MessageError):
         return decode_machines(data).machines if data else ()
@@ -121,14 +121,14 @@ def ask_machines(session: zenoh.Session, site: str) -> tuple[MachineState, ...]:
 
 
 def check_machines(machines: Iterable[MachineState]) -> Finding:
-    """Whether a machine rolls unlike the others on the same ground."""
+    """Whether a machine's rolling resistance differs from the others' on the same ground."""
     said = [f"{machine.name} {text}" for machine in machines if (text := rolls(machine))]
     message = "; ".join(said) or "none is known to roll unlike the others on the same ground"
     return Finding(Level.WARN if said else Level.PASS, "machines", message)
 
 
 def check_writers(servers: list[MapInfo]) -> Finding:
-    """Whether one map server alone takes the samples of the site."""
+    """Whether exactly one map server takes the site's samples."""
     names = [f"pid {info.server.pid} on host {info.server.host}, store {info.store}" for info in servers]
     if len(servers) == 1:
         return Finding(Level.PASS, "writer", names[0])
@@ -139,7 +139,7 @@ def check_writers(servers: list[MapInfo]) -> Finding:
 
 
 def check_followers(followers: list[FollowerState], info: MapInfo) -> Finding:
-    """Whether followers are of the server's store, and how far behind it."""
+    """Whether followers belong to the server's store, and their lag."""
     if not followers:
         return skipped("followers", "none answers; where readers are many, start `sitegrid follow`")
     if others := [one.name for one in followers if one.store != info.store]:
@@ -154,13 +154,13 @@ def check_followers(followers: list[FollowerState], info: MapInfo) -> Finding:
 
 
 def offset_of(info: MapInfo, asked_ns: tuple[int, int]) -> tuple[float, float]:
-    """How far this host's clock is ahead of the server's, and how well that is known [s]."""
+    """How far the host's clock is ahead of the server's, and the error bound [s]."""
     before_ns, after_ns = asked_ns
     return ((before_ns + after_ns) / 2 - info.wall_ns) * 1e-9, (after_ns - before_ns) / 2 * 1e-9
 
 
 def check_server(site: str, info: MapInfo | None, *, is_there: bool, role: str = "") -> Finding:
-    """Whether the map server answers. is_there: whether the router knows of one, role: what the keys are for."""
+    """Whether the map server answers. is_there: known to the router. role: of the keys."""
     if info is not None:
         text = f"site {site}: {info.samples_merged} samples in {info.cells} cells, journal row {info.journalled}"
         behind = f", merged only up to {info.merged}" if info.merged != info.journalled else ""
@@ -175,7 +175,7 @@ def check_server(site: str, info: MapInfo | None, *, is_there: bool, role: str =
 
 
 def check_losses(info: MapInfo) -> Finding:
-    """What was recorded or acknowledged once and is not in the map server's store, by machine and number."""
+    """Recorded or acknowledged samples missing in the store, by machine."""
     parts = {
         "declared lost": {name: counts.lost for name, counts in info.machines.items() if counts.lost},
         "acknowledged and gone": {name: counts.missing for name, counts in info.machines.items() if counts.missing},
@@ -191,7 +191,7 @@ def check_losses(info: MapInfo) -> Finding:
 
 
 def check_site(site: SiteConfig, info: MapInfo) -> Finding:
-    """Whether a site file means the same ground as the server."""
+    """Whether a site file has the server's name and frame."""
     if (site.name, site.frame) == (info.site.name, info.site.frame):
         return Finding(Level.PASS, "site", f"{site.name}, frame {site.frame}, as the map server has it")
     problem = f"this is {site.name} with frame {site.frame}, the map server has {info.site.name} with {info.site.frame}"
@@ -199,7 +199,7 @@ def check_site(site: SiteConfig, info: MapInfo) -> Finding:
 
 
 def check_clock(offset_s: float, error_s: float, site: SiteConfig | None) -> Finding:
-    """How far this host's clock is ahead of the server's. error_s: how well that is known."""
+    """Judge how far the host's clock is ahead of the server's. error_s: error bound."""
     ahead = "ahead of" if offset_s > 0 else "behind"
     message = f"{abs(offset_s):.2f} s {ahead} the map server's clock (+-{error_s:.2f} s)"
     advice = "set both clocks by NTP (chrony, systemd-timesyncd)"
@@ -212,8 +212,8 @@ def check_clock(offset_s: float, error_s: float, site: SiteConfig | None) -> Fin
 
 
 def check_time(info: MapInfo) -> Finding:
-    """Whether the stamps of machines and the server's clock fit each other."""
-    advice: dict[str, str] = {}  # by problem; counts stay until the server restarts, and may hide nothing
+    """Whether machines' stamps fit the server's clock."""
+    advice: dict[str, str] = {}  # by problem; counts stay until a restart and must not hide others
     if (ahead_s := (info.stamp_ns - info.wall_ns) * 1e-9) > AHEAD_S:
         trusted = {name: counts for name, counts in info.machines.items() if name not in info.distrusted}
         newest = max(trusted, key=lambda name: trusted[name].newest_ns, default="?")
@@ -231,7 +231,7 @@ def check_time(info: MapInfo) -> Finding:
 
 
 def check_version(own: str, other: str) -> Finding:
-    """Whether both sides run the same version; the wire has a version of its own, so others may work, too."""
+    """Whether both sides have one version; others may work too, since the wire is versioned separately."""
     if UNKNOWN in (own, other):
         return skipped("version", f"here {own}, map server {other}: one of them runs without being installed")
     if own == other:
@@ -245,9 +245,9 @@ def check_version(own: str, other: str) -> Finding:
 def ask_permission(
     session: zenoh.Session, site: str, machine: str, frame: str, folder: Path | None
 ) -> Ack | Refused | None:
-    """Send an empty batch of a random spool: the answer is its watermark, and no trace is left (docs/protocol.md).
+    """Send an empty batch of a random spool; the answer is its watermark and leaves no trace (docs/protocol.md).
 
-    folder: of the machine's keys, whose signature goes along where there is one.
+    folder: of the machine's keys; signed if they have a signature key.
     """
     key = keys.ingest(site, machine)
     batch = encode_batch(SampleBatch(machine, secrets.randbits(64) or 1, 1, empty(), frame))
@@ -259,7 +259,7 @@ def ask_permission(
 
 
 def check_permission(machine: str, answer: Ack | Refused | None, *, is_there: bool, has_keys: bool) -> Finding:
-    """Whether batches of a machine are taken, by the answer to an empty one."""
+    """Whether a machine's batches are accepted, by the answer to an empty one."""
     if isinstance(answer, Ack):
         return Finding(Level.PASS, "permission", f"batches of {machine} are taken")
     if isinstance(answer, Refused):
@@ -275,7 +275,7 @@ def check_permission(machine: str, answer: Ack | Refused | None, *, is_there: bo
 
 
 def receive_health(session: zenoh.Session, site: str, machine: str) -> Health | None:
-    """The health report of a running agent; None if none comes in, or it cannot be read."""
+    """A running agent's health report; None if missing or unreadable."""
     with session.declare_subscriber(keys.health(site, machine), zenoh.handlers.RingChannel(1)) as subscriber:
         end_s = time.monotonic() + HEALTH_S
         while not (sample := subscriber.try_recv()):
@@ -289,7 +289,7 @@ def receive_health(session: zenoh.Session, site: str, machine: str) -> Health | 
 
 
 def _ask(session: zenoh.Session, key: str, payload: bytes, attachment: bytes | None = None) -> bytes | None:
-    """The answer, None for none. A server that has just connected may not be seen yet: it is asked for a moment."""
+    """The answer, or None. A just connected server may not be visible yet, so queries are retried briefly."""
     end_s = time.monotonic() + KNOWN_S
     while True:
         for reply in session.get(key, payload=payload, attachment=attachment, timeout=ANSWER_S):

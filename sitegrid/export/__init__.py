@@ -1,1 +1,1 @@
-"""The map as files for GIS, CAD, notebooks and people; each is whole, or not there."""
+"""The map as files for GIS, CAD, notebooks and people; each file is complete or missing."""

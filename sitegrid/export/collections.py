@@ -1,4 +1,4 @@
-"""What of a map is features: collections by name."""
+"""Feature collections of a map by name."""
 
 from __future__ import annotations
 

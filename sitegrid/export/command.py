@@ -1,4 +1,4 @@
-"""One file written: its form by its name, what it holds, and all that is refused before anything is written."""
+"""Write one file: form by suffix, contents by options; everything is checked before writing."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from sitegrid.process.lifetime import raise_interrupts, return_large_blocks, say
 from sitegrid.times import iso
 
 FEATURES = ("zones", "segments", "worklist", "repairs", "changes", "tracks")
-OF_MACHINES = ("segments", "worklist", "repairs", "tracks", "samples")  # --machine can choose from these
+OF_MACHINES = ("segments", "worklist", "repairs", "tracks", "samples")  # --machine applies to these
 Write = Callable[[BinaryIO, Wanted, Sequence[str]], Mapping[str, int]]
 
 
 @dataclass(frozen=True)
 class FileForm:
-    """A form of files.
+    """A file form.
 
-    writer: module of this package and function. holds: what it can hold, at most `most` of it at once. usual: unless
-    named; a file that holds one of several has none.
+    writer: module of this package and function. holds: possible contents, at most `most` at once. usual: default
+    contents; empty if it holds only one kind.
     """
 
     writer: tuple[str, str]
@@ -35,7 +35,7 @@ class FileForm:
     most: int = 1
 
     def write(self) -> Write:
-        """The function that writes it; ModuleNotFoundError names what is not installed."""
+        """The writing function; ModuleNotFoundError names what is not installed."""
         module, name = self.writer
         function: Write = getattr(import_module(f"sitegrid.export.{module}"), name)
         return function
@@ -56,8 +56,8 @@ FORMS = {
 
 
 def run(arguments: Namespace) -> int:
-    """Write the file, and say what it holds."""
-    raise_interrupts()  # what is not complete is removed
+    """Write the file and report its contents."""
+    raise_interrupts()  # incomplete files are removed
     return_large_blocks()
     path: Path = arguments.file
     form = FORMS[path.suffix.lower()]
@@ -68,7 +68,7 @@ def run(arguments: Namespace) -> int:
         try:
             with whole_file(path) as file:
                 counts = write(file, wanted, what)
-        except OSError as error:  # of a full disk, which names no file
+        except OSError as error:  # a full disk's error names no file
             raise OSError(error.errno, error.strerror or str(error), str(path)) from None
     table = {"file": str(path), "site": wanted.info.site.name, "holds": counts, **version_of(wanted.info)}
     holds = ", ".join(f"{count} {name}" for name, count in counts.items())
@@ -78,9 +78,9 @@ def run(arguments: Namespace) -> int:
 
 
 def chosen(form: FileForm, path: Path, arguments: Namespace) -> Sequence[str]:
-    """What the file will hold; ConfigError where it cannot, or where an option would do nothing."""
+    """Contents of the file; ConfigError if impossible, or if an option had no effect."""
     named = (path.stem,) if path.stem in form.holds else form.usual
-    if not arguments.store and not arguments.what:  # of a running site only the map is known
+    if not arguments.store and not arguments.what:  # a running site only knows the map
         named = tuple(name for name in named if name != "tracks") or named
     what: Sequence[str] = arguments.what or named
     if not what or not set(what) <= set(form.holds) or len(set(what)) > form.most:

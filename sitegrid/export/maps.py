@@ -1,4 +1,4 @@
-"""What is exported: the map of a running site, of a store, or of archives; all answer the same queries."""
+"""The exported map: of a running site, a store, or archives; all answer the same queries."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SITE_FILE, CONFIG_FILE = "--site-file", "--config"
 
 @dataclass(frozen=True)
 class OpenMap:
-    """ask: the whole answer to a query. rows: journal rows that may hold samples; None where only the map is known."""
+    """ask: complete answer to a query. rows: journal rows that may hold samples; None if only the map is known."""
 
     ask: Callable[[MapQuery[Any]], Any]
     rows: Callable[[Selection], Iterator[JournalRows]] | None = None
@@ -36,7 +36,7 @@ class OpenMap:
 
 @contextmanager
 def opened(arguments: Namespace) -> Iterator[OpenMap]:
-    """The map that the options name, until the block ends."""
+    """Open the map named by the options."""
     if arguments.store:
         with ExitStack() as stack:
             yield _of_store(_folder(arguments, stack), arguments)
@@ -49,7 +49,7 @@ def opened(arguments: Namespace) -> Iterator[OpenMap]:
 
 
 def _folder(arguments: Namespace, stack: ExitStack) -> Path:
-    """A store: the one that is named, or one that is folded from archives and goes away with the stack."""
+    """The named store, or a temporary one folded from archives."""
     from mapserver.journal.location import JournalLocation
     from sitegrid.refold.command import fold
 
@@ -93,5 +93,5 @@ def _answered(answers: Answers, query: MapQuery[Any], _: Origin | None) -> Answe
 
 
 def version_of(info: Any) -> Mapping[str, Any]:
-    """The map that a file is of, as answers name it."""
+    """A file's map version, named as in answers."""
     return {"store": info.store, "merged": info.merged, "fact": info.fact}

@@ -1,4 +1,4 @@
-"""Cells as a cloud-optimised GeoTIFF (rasterio): a band for each layer, in the site's own projection."""
+"""Cells as a cloud-optimised GeoTIFF (rasterio): a band per layer, in the site's projection."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sitegrid.export.wanted import Wanted
 from sitegrid.notebook import unit_of
 from sitegrid.times import iso
 
-CACHE_MB = 8  # of GDAL's blocks; its default is a twentieth of the host's memory
-# As GDAL's driver makes it: bits survive, and no overview has a value that no cell has.
+CACHE_MB = 8  # GDAL's block cache; its default is 5 % of the host's memory
+# GDAL's COG driver, lossless; overviews only contain values of cells.
 COG = {"driver": "COG", "compress": "DEFLATE", "predictor": 3, "overview_resampling": "NEAREST"}
 
 
 def write_tif(file: BinaryIO, wanted: Wanted, _: object) -> dict[str, int]:
-    """Write the layers of all cells; NaN is unknown. GDAL writes into memory, since it hides what a full disk says."""
+    """Write all layers; NaN: unknown. GDAL writes to memory, because it hides errors of a full disk."""
     region = wanted.region()
     bounds, cell_m, version = region.bounds, region.cell_m, region.version
     layers = dict(region.layers)
@@ -30,8 +30,8 @@ def write_tif(file: BinaryIO, wanted: Wanted, _: object) -> dict[str, int]:
         "crs": wanted.info.site.crs,
         "transform": rasterio.Affine(cell_m, 0.0, bounds.west_m, 0.0, -cell_m, bounds.north_m),
     }
-    del region  # each layer goes once it is written
-    # Bands apart, and deflated at once: the plain file is in memory too
+    del region  # frees each layer after writing
+    # Separate, compressed bands: the plain file is in memory too.
     plainly = {"driver": "GTiff", "tiled": True, "interleave": "band", "compress": "DEFLATE", "zlevel": 1}
     with rasterio.Env(GDAL_CACHEMAX=CACHE_MB), MemoryFile() as plain, MemoryFile() as whole:
         with plain.open(**plainly, **shape, **place, dtype="float32", nodata=np.nan) as bands:

@@ -1,4 +1,4 @@
-"""One page for a shift lead: the map, where work pays, what repairs saved, odd machines, how good the data is."""
+"""A shift lead's page: map, where work pays, savings of repairs, odd machines, data quality."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ td:first-child,th:first-child{text-align:left}"""
 
 
 def write_html(file: BinaryIO, wanted: Wanted, _: object) -> dict[str, int]:
-    """Write the page; it needs nothing else to be looked at."""
+    """Write the page, self-contained."""
     worklist = wanted.worklist()
     parts = (
         _head(wanted),
@@ -120,7 +120,7 @@ def _machines(wanted: Wanted) -> Iterator[str]:
 
 
 def _known(wanted: Wanted) -> Sequence[MachineState]:
-    """What the map server knows of machines; nothing where it does not run."""
+    """The map server's view of the machines; empty if it does not run."""
     with suppress(QueryError):
         machines: Sequence[MachineState] = wanted.map.ask(MachinesQuery()).machines
         return machines

@@ -1,4 +1,4 @@
-"""Samples of a store with their identity, as machines sent them; and the tracks that they lie on."""
+"""A store's samples with identity, as sent; and the machines' tracks."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from sitegrid.features.feature import Collection
 from sitegrid.features.kinds import TRACK
 
 Samples = Mapping[str, AnyArray]  # columns by name (n,)
-BREAK_NS = 30 * 10**9  # without a sample: a machine drives one every few seconds, or stands; a track ends there
+BREAK_NS = 30 * 10**9  # a gap ends a track: driving machines sample every few seconds
 OF_TRACK = ("stamp_ns", "x_m", "y_m", "heading_rad")
 
 
 def samples(wanted: Wanted) -> Iterator[Samples]:
-    """Samples that are wanted, many at a time: machine, spool_id, seq, and the columns of a sample."""
+    """Chosen samples in chunks: machine, spool_id, seq, and a sample's columns."""
     roads, rows = wanted.roads, wanted.map.rows
     if not rows:
         raise ConfigError("--what", "samples and tracks are in stores and archives: give --store")
@@ -53,7 +53,7 @@ def _columns(rows: JournalRows) -> Samples:
 
 
 def _tracks(wanted: Wanted) -> Iterator[tuple[str, Samples]]:
-    """What each machine drove, in the order of its stamps."""
+    """Each machine's samples by stamp."""
     parts = [{name: some[name] for name in ("machine", *OF_TRACK)} for some in samples(wanted)]
     if not parts:
         return
@@ -65,7 +65,7 @@ def _tracks(wanted: Wanted) -> Iterator[tuple[str, Samples]]:
 
 
 def tracks(wanted: Wanted) -> Collection:
-    """Lines that machines drove, each without a break."""
+    """Driven lines, split at gaps."""
     return Collection(TRACK, list(_lines(wanted)))
 
 
@@ -80,7 +80,7 @@ def _lines(wanted: Wanted) -> Iterator[dict[str, Any]]:
 
 
 def write_tum(file: BinaryIO, wanted: Wanted, _: object) -> dict[str, int]:
-    """One machine's track as `stamp x y z qx qy qz qw` [s, m, -], in `map`; heights are not known: 0."""
+    """One machine's track as `stamp x y z qx qy qz qw` [s, m, -] in `map`; z is unknown: 0."""
     known = dict(_tracks(wanted))
     if not known:
         nothing_there(wanted.info)

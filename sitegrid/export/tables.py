@@ -1,4 +1,4 @@
-"""Tables: cells, samples and features as Parquet and CSV, some rows at a time (pyarrow)."""
+"""Tables: cells, samples and features as Parquet and CSV, in chunks (pyarrow)."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from sitegrid.export.samples import samples
 from sitegrid.export.wanted import Wanted, nothing_there
 from sitegrid.features.gdal import columns
 
-ROWS = 64  # of a map at a time: 2 MB of a site that is 1 km wide
+ROWS = 64  # map rows per chunk: 2 MB for a site 1 km wide
 
 
 def write_csv(file: BinaryIO, wanted: Wanted, what: Sequence[str]) -> dict[str, int]:
-    """What has a table as text; an unknown value is an empty field."""
+    """A table as text; unknown values are empty fields."""
     return _written(pyarrow.csv.CSVWriter, file, wanted, what[0])
 
 
 def write_parquet(file: BinaryIO, wanted: Wanted, what: Sequence[str]) -> dict[str, int]:
-    """What has a table as Parquet; features as GeoParquet 1.1, in the site's frame."""
+    """A table as Parquet; features as GeoParquet 1.1 in the site's frame."""
     if what[0] in ("cells", "samples"):
         return _written(pyarrow.parquet.ParquetWriter, file, wanted, what[0])
     table = _of_features(wanted, what[0])
@@ -55,12 +55,12 @@ def _table(values: Mapping[str, AnyArray]) -> Any:
 
 
 def _type(column: AnyArray) -> Any:
-    """The type of a column where NumPy's does not say it: times are UTC, and texts may all be missing."""
+    """Types that NumPy leaves open: times are UTC; texts may all be missing."""
     return {"M": pa.timestamp("ms", "UTC"), "O": pa.string()}.get(column.dtype.kind)
 
 
 def _cells(region: Region, projection: Projection) -> Iterator[Any]:
-    """Cells of which anything is known, from the south."""
+    """Known cells, from the south."""
     for first in range(0, len(region.y_m), ROWS):
         part = {name: values[first : first + ROWS] for name, values in region.layers.items()}
         known = np.any([np.isfinite(values) for values in part.values()], axis=0)
@@ -73,7 +73,7 @@ def _cells(region: Region, projection: Projection) -> Iterator[Any]:
 
 
 def _of_features(wanted: Wanted, what: str) -> Any:
-    """Features with their geometry as WKB, and what GeoParquet says of it (geoparquet.org, 1.1.0)."""
+    """Features with WKB geometry and GeoParquet metadata (geoparquet.org, 1.1.0)."""
     features = columns(COLLECTIONS[what](wanted))
     shape = {"encoding": "WKB", "geometry_types": [features.geometry], "crs": CRS(wanted.info.site.crs).to_json_dict()}
     geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": shape}}

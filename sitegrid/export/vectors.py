@@ -1,4 +1,4 @@
-"""Features as files of GIS and CAD: GeoPackage, FlatGeobuf, GeoJSON, DXF."""
+"""Features for GIS and CAD: GeoPackage, FlatGeobuf, GeoJSON, DXF."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from sitegrid.export.wanted import Wanted
 from sitegrid.features.feature import Collection, FeatureKind
 from sitegrid.features.gdal import LAT_LON, columns, in_memory, write
 
-ENTITY = FeatureKind("LineString", lambda entity: [entity[1]], {"Layer": (str, "0")})  # of DXF
-# QGIS 3.22 warns of the version that GDAL writes by default.
+ENTITY = FeatureKind("LineString", lambda entity: [entity[1]], {"Layer": (str, "0")})  # for DXF
+# QGIS 3.22 warns of GDAL's default version.
 GPKG_VERSION = "1.3"
-# As QGIS makes it (its documentation: "Saving styles in a database").
+# Schema by QGIS ("Saving styles in a database").
 STYLES = """
 CREATE TABLE layer_styles (
     id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, f_table_catalog TEXT, f_table_schema TEXT, f_table_name TEXT,
@@ -33,12 +33,12 @@ INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES ('layer_sty
 STYLE = """INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,
     styleQML, styleSLD, useAsDefault, description, owner) VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')"""
 BAD, DONE, DARK = (200, 30, 30), (30, 90, 200), (60, 60, 60)  # red, green, blue
-LINES = {"worklist": (BAD, 1.4), "repairs": (DONE, 1.4), "tracks": (DARK, 0.2)}  # colour, width in mm
+LINES = {"worklist": (BAD, 1.4), "repairs": (DONE, 1.4), "tracks": (DARK, 0.2)}  # colour, width [mm]
 Colour = tuple[int, int, int]
 
 
 def write_gpkg(file: BinaryIO, wanted: Wanted, what: Sequence[str]) -> dict[str, int]:
-    """A layer for each of these, in the site's frame, with a style that QGIS applies by itself."""
+    """A layer per kind in the site's frame, with a style that QGIS applies by itself."""
     tables = {name: columns(COLLECTIONS[name](wanted)) for name in what}
     with TemporaryDirectory(prefix="sitegrid-export-") as folder:
         path = Path(folder) / "map.gpkg"
@@ -77,7 +77,7 @@ def _in_degrees(driver: str, file: BinaryIO, wanted: Wanted, what: str) -> dict[
 
 
 def write_dxf(file: BinaryIO, wanted: Wanted, what: Sequence[str]) -> dict[str, int]:
-    """Lines in metres of the site's frame, as CAD wants them; areas by their outlines, each kind on a layer."""
+    """Lines in metres of the site's frame for CAD; areas as outlines, a layer per kind."""
     collections = {name: COLLECTIONS[name](wanted) for name in what}
     entities = {name: list(_entities(name, collection)) for name, collection in collections.items()}
     table = columns(Collection(ENTITY, [entity for some in entities.values() for entity in some]))
@@ -86,7 +86,7 @@ def write_dxf(file: BinaryIO, wanted: Wanted, what: Sequence[str]) -> dict[str, 
 
 
 def _entities(name: str, collection: Collection) -> Iterator[tuple[str, Floats]]:
-    """Lines with the names of their layers."""
+    """Lines with layer names."""
     for item in collection.items:
         properties = collection.properties(item)
         kind = properties.get("name") or properties.get("machine") if name in ("zones", "tracks") else ""
@@ -95,7 +95,7 @@ def _entities(name: str, collection: Collection) -> Iterator[tuple[str, Floats]]
 
 
 def style_of(layer: str, boundaries: Sequence[float]) -> str:
-    """The style of a layer. boundaries: of the classes of resistance."""
+    """QGIS style of a layer. boundaries: between resistance classes."""
     if layer == "zones":
         rows = [(f"value='{kind}'", name, _fill(colour)) for kind, (name, colour) in enumerate(_classes(boundaries))]
         return _qml("categorizedSymbol", "class", "categories", "category", rows)
@@ -109,14 +109,14 @@ def style_of(layer: str, boundaries: Sequence[float]) -> str:
 
 
 def _classes(boundaries: Sequence[float]) -> list[tuple[str, Colour]]:
-    """Names and colours of the classes of ground; a site with others than the usual has numbers for names."""
+    """Names and colours of ground classes; unusual classes are numbered."""
     usual = len(boundaries) + 1 == len(ZONES)
     zones = [ZONES[kind % len(ZONES)] for kind in range(len(boundaries) + 1)]
     return [(zone.name if usual else str(kind), zone.bgr[::-1]) for kind, zone in enumerate(zones)]
 
 
 def _qml(kind: str, attribute: str, plural: str, single: str, rows: Iterable[tuple[str, str, str]]) -> str:
-    """A renderer: for each row what it is of, its label, its symbol."""
+    """A renderer from rows of (selector, label, symbol)."""
     known = list(enumerate(rows))
     parts = [f"<{single} {what} symbol='{i}' label='{escape(name)}' render='true'/>" for i, (what, name, _) in known]
     listed = f"<{plural}>{''.join(parts)}</{plural}>" if plural else ""
@@ -142,7 +142,7 @@ def _text(colour: Colour, alpha: int) -> str:
 
 
 def _symbol(kind: str, layer: str, **options: str) -> str:
-    """A symbol, whose name is still open."""
+    """A symbol; its name is left as a placeholder."""
     listed = "".join(f"<Option type='QString' name='{name}' value='{value}'/>" for name, value in options.items())
     inner = f"<layer class='{layer}' enabled='1' pass='0' locked='0'><Option type='Map'>{listed}</Option></layer>"
     return f"<symbol type='{kind}' name='{{name}}' alpha='1' clip_to_extent='1' force_rhr='0'>{inner}</symbol>"

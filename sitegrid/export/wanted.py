@@ -1,4 +1,4 @@
-"""What is wanted of a map: which part of it, as of when; the queries that follow from it."""
+"""The exported part of a map and its time, and the queries for it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SMALLER = "give --bounds, fewer --layers, or --resolution"
 
 @dataclass(frozen=True)
 class Wanted:
-    """cells, roads: the queries of what is wanted; roads.bounds is None for the whole map."""
+    """cells, roads: the queries; roads.bounds is None for the whole map."""
 
     map: OpenMap
     info: MapInfo
@@ -39,7 +39,7 @@ class Wanted:
         return projection_of(self.info.site)
 
     def region(self, query: RegionQuery | None = None) -> Region:
-        """The layers of its cells, or of what another query names; refused where none is known."""
+        """Layers of the cells, or of another query; refused if all are unknown."""
         try:
             region: Region = self.map.ask(query or self.cells)
         except QueryError as error:
@@ -51,7 +51,7 @@ class Wanted:
         return region
 
     def worklist(self, limit: int = 1000) -> Worklist:
-        """Where work on them pays."""
+        """Road sections worth work."""
         roads = self.roads
         query = WorklistQuery(as_of_ns=roads.as_of_ns, bounds=roads.bounds, machine=roads.machine, limit=limit)
         answer: Worklist = self.map.ask(query)
@@ -59,7 +59,7 @@ class Wanted:
 
 
 def parse_wanted(arguments: Namespace, opened: OpenMap) -> Wanted:
-    """Parse the options; QueryError or ConfigError says what is wrong with which."""
+    """Parse the options; QueryError or ConfigError names the wrong one."""
     info: MapInfo = opened.ask(InfoQuery())
     if not info.bounds:
         nothing_there(info)
@@ -82,13 +82,13 @@ def _only(arguments: Namespace, *names: str) -> Namespace:
 
 
 def nothing_there(info: MapInfo) -> NoReturn:
-    """Refuse what would be an empty file."""
+    """Refuse to write an empty file."""
     problem = f"nothing is known there and then: {where_it_lies(info.bounds, info.site.cell_m)}"
     raise ConfigError(f"site {info.site.name}", problem)
 
 
 def coarser(wanted: Wanted, most: int) -> RegionQuery:
-    """The query of its cells in larger ones, where there are more than so many to a side."""
+    """The cells' query with larger cells, if a side has more than `most`."""
     if wanted.cells.resolution_m:
         return wanted.cells
     bounds, cell_m = wanted.cells.bounds, wanted.info.site.cell_m

@@ -1,1 +1,1 @@
-"""What a map shows as features: areas, lines and places with properties; as GeoJSON, and as files of GIS."""
+"""Map contents as features: geometries with properties, as GeoJSON and GIS files."""

@@ -1,4 +1,4 @@
-"""Features: geometries in `map` [m] with properties of declared types; GeoJSON (RFC 7946) of them."""
+"""Features: geometries in `map` [m] with typed properties; their GeoJSON (RFC 7946)."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ from protocol.site.site_config import Projection, SiteConfig
 from sitegrid.features.meridian import geometry
 from sitegrid.times import iso
 
-Time = datetime  # the type of a field of times: ISO 8601 in UTC, from a stamp
+Time = datetime  # type of time fields: ISO 8601 in UTC, from a stamp
 
 
 @dataclass(frozen=True)
 class FeatureKind:
-    """What all features of a collection are, also of an empty one: so programs know its columns.
+    """Type of a collection's features, so that even an empty one has columns.
 
-    geometry: Point, LineString or Polygon. lines: corners (n, 2) in `map` [m] of an item: of a place one, of a line
-    its places, of an area its closed rings. fields: type of each property, and where an item has it: names of
-    attributes, keys and indices with dots between them. A property may be None.
+    geometry: Point, LineString or Polygon. lines: corners (n, 2) in `map` [m] of an item: a point, a line, or closed
+    rings. fields: each property's type and its dotted path of attributes, keys and indices. Properties may be None.
     """
 
     geometry: str
@@ -35,13 +34,13 @@ class FeatureKind:
 
 @dataclass(frozen=True)
 class Collection:
-    """Items of one kind; they may be made as they are iterated over, once."""
+    """Items of one kind; may be a one-time iterator."""
 
     kind: FeatureKind
     items: Iterable[Any]
 
     def properties(self, item: Any) -> dict[str, Any]:
-        """Properties of an item."""
+        """An item's properties."""
         table = {
             name: (field_type, reduce(_part, path.split("."), item))
             for name, (field_type, path) in self.kind.fields.items()
@@ -58,12 +57,12 @@ def _part(item: Any, name: str) -> Any:
 
 
 def projection_of(site: SiteInfo) -> Projection:
-    """From the frame of a site to latitude and longitude."""
+    """From a site's frame to latitude and longitude."""
     return Projection(SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m))
 
 
 def geojson(collection: Collection, projection: Projection) -> dict[str, Any]:
-    """As GeoJSON, in longitude and latitude [deg]; its features are made as they are iterated over."""
+    """GeoJSON in longitude and latitude [deg]; features are lazy."""
     return {"type": "FeatureCollection", "features": _geojson(collection, projection)}
 
 
@@ -74,7 +73,7 @@ def _geojson(collection: Collection, projection: Projection) -> Iterator[dict[st
 
 
 def shape_of(kind: FeatureKind, item: Any, projection: Projection | None) -> dict[str, Any]:
-    """Its geometry as GeoJSON has it: longitude, latitude [deg], cut at the 180th meridian; without projection in m."""
+    """GeoJSON geometry: longitude, latitude [deg], cut at the 180th meridian; without projection [m]."""
     lines = [_degrees(line, projection) if projection else line.tolist() for line in kind.lines(item)]
     nested: Any = lines if kind.geometry == "Polygon" else lines[0]
     nested = nested[0] if kind.geometry == "Point" else nested

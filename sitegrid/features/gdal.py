@@ -1,4 +1,4 @@
-"""Features as columns, and as files that GDAL writes (pyogrio)."""
+"""Features as columns, and as files written by GDAL (pyogrio)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from protocol.site.site_config import Projection
 from sitegrid.features.feature import Collection, Time, shape_of
 
 LAT_LON = "EPSG:4326"
-GDAL_UTC = 100  # the time zone (OGRFieldDefn, TZFlag)
+GDAL_UTC = 100  # time zone flag (OGRFieldDefn, TZFlag)
 
 
 class Columns(NamedTuple):
-    """Features side by side. shapes: WKB (n,). values: by name (n,), missing ones None, NaN or NaT."""
+    """Feature columns. shapes: WKB (n,). values: by name (n,); missing: None, NaN or NaT."""
 
     geometry: str
     shapes: AnyArray
@@ -28,7 +28,7 @@ class Columns(NamedTuple):
 
 
 def columns(collection: Collection, projection: Projection | None = None) -> Columns:
-    """Columns of a collection, in `map` [m]; with a projection in longitude and latitude, all of several parts."""
+    """Columns in `map` [m]; with a projection: longitude and latitude, all multi-part."""
     kind, shapes, rows = collection.kind, [], []
     for item in collection.items:
         shapes.append(shapely.to_wkb(shapely.geometry.shape(shape_of(kind, item, projection))))
@@ -48,7 +48,7 @@ def _column(values: Sequence[Any], kind: type) -> AnyArray:
 
 
 def write(to: io.BytesIO | Path, driver: str, table: Columns, layer: str, crs: str, **options: Any) -> None:
-    """Write one layer. driver: as GDAL names it; crs: as PROJ reads it."""
+    """Write one layer. driver: GDAL's name. crs: readable by PROJ."""
     several = table.geometry.startswith("Multi")
     zones = {name: np.full(len(column), GDAL_UTC) for name, column in table.values.items() if column.dtype.kind == "M"}
     words = {"layer": layer, "crs": crs, "geometry_type": table.geometry, "driver": driver, "promote_to_multi": several}
@@ -57,12 +57,12 @@ def write(to: io.BytesIO | Path, driver: str, table: Columns, layer: str, crs: s
 
 
 def in_memory(driver: str, table: Columns, layer: str, crs: str) -> bytes:
-    """A file of one layer; on disk GDAL hides that there is no room."""
+    """A one-layer file; on disk GDAL hides a full disk."""
     made = io.BytesIO()
     write(made, driver, table, layer, crs)
     return made.getvalue()
 
 
 def flat_geobuf(collection: Collection, projection: Projection, layer: str) -> Iterator[bytes]:
-    """A FlatGeobuf file in longitude and latitude: unlike GeoJSON, an empty one says what its features will be."""
+    """FlatGeobuf in longitude and latitude; unlike GeoJSON, it has columns even if empty."""
     yield in_memory("FlatGeobuf", columns(collection, projection), layer, LAT_LON)

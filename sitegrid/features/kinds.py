@@ -1,4 +1,4 @@
-"""Kinds of features of what a site has: changes, machines, tracks, roads and work on them. Ground: `zones.py`."""
+"""Feature kinds of a site: changes, machines, tracks, roads and road work. Ground: `zones.py`."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def _floats(*names: str) -> dict[str, tuple[type, str]]:
     return {name: (float, name) for name in names}
 
 
-# Of `Fuel`, where it is known.
+# From `Fuel`, if known.
 FUEL = {
     "burned_litres_ph": (float, "fuel.burned_ph.0"),
     "predicted_litres_ph": (float, "fuel.predicted_ph.0"),
     "burned_share": (float, "fuel.share"),
 }
 
-# Of `GroundChange`: rectangles around changes of the ground.
+# From `GroundChange`: rectangles.
 CHANGE = FeatureKind(
     "Polygon",
     _rectangle,
@@ -44,7 +44,7 @@ CHANGE = FeatureKind(
         **_floats("resistance_before", "resistance_after"),
     },
 )
-# Of poses as tables.
+# From poses as tables.
 MACHINE = FeatureKind(
     "Point",
     lambda pose: [np.array([(pose["x_m"], pose["y_m"])])],
@@ -55,13 +55,13 @@ MACHINE = FeatureKind(
         **_floats("age_s"),
     },
 )
-# Of tables: machine, line (n, 2), first_ns, last_ns.
+# From tables: machine, line (n, 2), first_ns, last_ns.
 TRACK = FeatureKind(
     "LineString",
     lambda track: [track["line"]],
     {"machine": (str, "machine"), "first_time": (Time, "first_ns"), "last_time": (Time, "last_ns")},
 )
-# Of `RoadSegment`, in the direction that is the first of each pair, which becomes two: few programs read lists.
+# From `RoadSegment`; pairs by direction, the first along the line, become two fields, because few programs read lists.
 SEGMENT = FeatureKind(
     "LineString",
     _line,
@@ -78,7 +78,7 @@ SEGMENT = FeatureKind(
         **FUEL,
     },
 )
-# Of `WorklistRow`; of what is lost its value, `_low` and `_high` (90 %).
+# From `WorklistRow`; losses as value, `_low` and `_high` (90 %).
 WORK = FeatureKind(
     "LineString",
     lambda row: _line(row.segment),
@@ -95,7 +95,7 @@ WORK = FeatureKind(
         **{name: (field_type, f"segment.{path}") for name, (field_type, path) in SEGMENT.fields.items()},
     },
 )
-# Of `RoadChange`: repaired, or become worse.
+# From `RoadChange`: better or worse.
 REPAIR = FeatureKind(
     "LineString",
     _line,
@@ -112,7 +112,7 @@ REPAIR = FeatureKind(
 
 
 def tracks(tracks_of: Mapping[str, Sequence[Pose]]) -> Collection:
-    """Lines that machines drove, made as they are iterated over."""
+    """Driven lines, lazily."""
     return Collection(TRACK, _tracks(tracks_of))
 
 

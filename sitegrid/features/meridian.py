@@ -1,6 +1,6 @@
-"""GeoJSON across the 180th meridian: cut there (RFC 7946, 3.1.9), else programs lead it round the Earth.
+"""GeoJSON cut at the 180th meridian (RFC 7946, 3.1.9); else programs draw it around the Earth.
 
-Places are longitude and latitude [deg]; between the two cuts longitudes count from 0 to 360.
+Places are longitude and latitude [deg]; internally longitudes run from 0 to 360.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MERIDIAN = 180.0
 
 
 def geometry(kind: str, coordinates: Any) -> dict[str, Any]:
-    """A geometry, of several parts where it is cut. kind: Point, LineString or Polygon; rings are closed."""
+    """A geometry, multi-part if cut. kind: Point, LineString or Polygon with closed rings."""
     lines = [np.array(line, np.float64) for line in (coordinates if kind == "Polygon" else [coordinates])]
     if kind == "Point" or not any(np.ptp(line[:, 0]) > MERIDIAN for line in lines):
         return {"type": kind, "coordinates": coordinates}
@@ -35,7 +35,7 @@ def _on_earth(line: Floats) -> list[list[float]]:
 
 
 def _cut(line: Floats) -> list[Floats]:
-    """Parts of a line (n, 2), each on one side of the meridian and up to it."""
+    """Parts of a line (n, 2), each on one side, up to the meridian."""
     lon, lat = line.T
     after = np.flatnonzero(np.diff(lon < MERIDIAN)) + 1
     share = (MERIDIAN - lon[after - 1]) / (lon[after] - lon[after - 1])
@@ -45,7 +45,7 @@ def _cut(line: Floats) -> list[Floats]:
 
 
 def _cut_ring(ring: Floats) -> list[Floats]:
-    """Parts of a closed ring, each from the meridian to the meridian; the ring itself where it does not meet it."""
+    """Parts of a closed ring, from meridian to meridian; an uncut ring as it is."""
     begins = np.flatnonzero(np.diff(ring[:, 0] < MERIDIAN)) + 1
     if not len(begins):
         return [ring]
@@ -54,7 +54,7 @@ def _cut_ring(ring: Floats) -> list[Floats]:
 
 
 def _areas(rings: Sequence[Floats], *, is_west: bool) -> list[list[Floats]]:
-    """The parts of a polygon on one side, each its outline and its holes."""
+    """A polygon's parts on one side: outline, then holes."""
     pieces = [piece for piece in chain(*map(_cut_ring, rings)) if (piece[1:-1, 0].mean() < MERIDIAN) == is_west]
     parts = [piece for piece in pieces if (piece[[0, -1], 0] == MERIDIAN).all()]
     areas = [[outline] for outline in _joined(parts)]
@@ -64,7 +64,7 @@ def _areas(rings: Sequence[Floats], *, is_west: bool) -> list[list[Floats]]:
 
 
 def _joined(parts: Sequence[Floats]) -> list[Floats]:
-    """Closed rings of parts, joined along the meridian: from south to north every second stretch lies inside."""
+    """Close parts along the meridian: from south to north every second interval is inside."""
     ends = np.argsort([part[end, 1] for part in parts for end in (0, -1)], kind="stable").tolist()
     across = dict(zip(ends, chain(*((b, a) for a, b in zip(ends[::2], ends[1::2], strict=True))), strict=True))
     rings, left = [], set(range(len(parts)))
@@ -81,7 +81,7 @@ def _joined(parts: Sequence[Floats]) -> list[Floats]:
 
 
 def _holds(ring: Floats, place: Floats) -> bool:
-    """Whether a place lies in a ring: an odd number of its sides lies to the west of it."""
+    """Whether a place is in a ring: an odd number of sides lies to its west."""
     (lon, lat), (to_lon, to_lat) = ring[:-1].T, ring[1:].T
     crosses = (lat > place[1]) != (to_lat > place[1])
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Areas of one kind of ground, from the map's tiles: polygons with holes along the edges of cells."""
+"""Ground areas from map tiles: polygons with holes along cell edges."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from protocol.site.ground_classes import ZONES
 from sitegrid.features.feature import Collection, FeatureKind
 
 ZONE = FeatureKind("Polygon", lambda zone: zone["lines"], {"class": (int, "class"), "name": (str, "name")})
-LEAST_CELLS = 4  # smaller areas of one kind are noise to the eye
-# A picture's side: 17 MB while its areas are followed. An area that is wider than 2 km is cut there.
+LEAST_CELLS = 4  # smaller areas look like noise
+# Tiles per side of a picture: 17 MB. Wider areas (2 km) are cut.
 MOST_TILES = 32
-UNKNOWN = 255  # in place of a class
+UNKNOWN = 255  # class of unknown cells
 
 
 def zones(answer: TilesAnswer, boundaries: Sequence[float], within: Bounds | None = None) -> Collection:
-    """Areas of cells of the same class of resistance; made as they are iterated over. within: of these cells alone."""
+    """Areas of one resistance class, lazily. within: only these cells."""
     classes = np.digitize(PLANES["resistance"].values(), boundaries).astype(np.uint8)
     classes[0] = UNKNOWN
     return Collection(ZONE, _zones(answer, classes, len(boundaries) + 1, within))
@@ -43,7 +43,7 @@ def _zones(answer: TilesAnswer, classes: AnyArray, count: int, within: Bounds | 
 
 
 def _cut(image: AnyArray, corner: Ints, geometry: GridGeometry, within: Bounds) -> AnyArray:
-    """Classes of the cells that a rectangle touches; the others are unknown."""
+    """Classes of the cells that a rectangle touches; others unknown."""
     window = geometry.window(within)
     first = np.array([window.row, window.column]) - corner[::-1]
     rows, columns = (
@@ -60,7 +60,7 @@ def _closed(ring: Floats) -> Floats:
 
 
 def _pictures(tiles: Iterable[MapTile]) -> Iterator[list[MapTile]]:
-    """Tiles that touch, MOST_TILES to a side at most: what lies far away costs its own picture alone."""
+    """Groups of touching tiles, at most MOST_TILES a side, so that distant areas do not share a picture."""
     left = {(tile.x, tile.y): tile for tile in tiles}
     while left:
         group, edge = dict[tuple[int, int], MapTile](), [next(iter(left))]
@@ -88,10 +88,10 @@ def _classes(tiles: Sequence[MapTile], classes: AnyArray) -> tuple[AnyArray, Int
 
 
 def _polygons(mask: AnyArray) -> Iterator[list[Floats]]:
-    """Areas of a mask as lists of rings (n, 2) along the cells' edges: the outline, then holes.
+    """Areas of a mask as rings (n, 2) along cell edges: outline, then holes.
 
-    OpenCV follows the centres of pixels; of a mask twice as fine, one pixel wider, these are the cells' edges. It cuts
-    the corners of holes.
+    OpenCV follows pixel centres; in a mask of twice the resolution, one pixel wider, these are cell edges. It cuts the
+    corners of holes.
     """
     fine = np.zeros((2 * mask.shape[0] + 1, 2 * mask.shape[1] + 1), np.uint8)
     for dy in range(3):

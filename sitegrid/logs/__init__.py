@@ -1,1 +1,1 @@
-"""Recordings of real machines: what of one is usable, its positions and ground, and how far they are off."""
+"""Recordings of real machines: usability, positions, ground, and errors of both."""

@@ -1,7 +1,6 @@
-"""What of a recording is usable, and why the rest is not: manifest, files, clocks, rates, gaps.
+"""Usability of a recording, and reasons: manifest, files, clocks, rates, gaps.
 
-`examine` reads every file of the sensors in use. Functions that judge are pure; each of their findings is a line that
-says what to do.
+`examine` reads every file of the sensors in use. Judging functions are pure; each finding says what to do.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ from sitegrid.logs.wheels import check_wheels
 from sitegrid.proof.figures import Row, rounded
 
 PAGE = "docs/log-folders.md"
-PAUSE = 5.0  # intervals: a longer one is a gap, if it lasts LEAST_GAP_S
+PAUSE = 5.0  # intervals: longer is a gap, from LEAST_GAP_S
 LEAST_GAP_S = 1.0
-REPEATS, HELD_S = 0.2, 10.0  # share of fixes that repeat the one before, and time at one place, of a sound receiver
+REPEATS, HELD_S = 0.2, 10.0  # limits of a sound receiver: share of repeated fixes, time at one place
 ADVICE = {
     "below_least": "rows that the receiver itself calls bad; no harm if they are few",
     "not_finite": "rows without a fix; no harm if they are few",
@@ -45,9 +44,9 @@ ADVICE = {
 
 @dataclass(frozen=True)
 class SensorData:
-    """What the file of a sensor holds. refused: rows by reason; first: where the first of each stands.
+    """Contents of a sensor's file. refused: rows by reason; first: place of the first of each.
 
-    problem: why nothing can be used, else empty.
+    problem: why nothing is usable, else empty.
     """
 
     sensor: SensorConfig
@@ -58,13 +57,13 @@ class SensorData:
 
     @property
     def stamps_ns(self) -> Ints:
-        """Stamps (n,) of the usable rows."""
+        """Stamps (n,) of usable rows."""
         return np.array([reading.stamp_ns for reading in self.readings], np.int64)
 
 
 @dataclass(frozen=True)
 class LogCheck:
-    """begins: time of the first reading, empty without one. rows: a table of the sensors. findings: what to know."""
+    """begins: first reading's time, empty without one. rows: table of sensors. findings: notes."""
 
     begins: str
     rows: list[Row]
@@ -77,7 +76,7 @@ class LogCheck:
 
 
 def examine(manifest: Path, data: Path | None = None) -> LogCheck:
-    """Look at a log, and at what is known of it beside its manifest; raises ConfigError on the manifest."""
+    """Examine a log and the files beside its manifest; ConfigError on the manifest."""
     log, folder = open_log(manifest, data), manifest if manifest.is_dir() else manifest.parent
     read = [_read(log, source.sensor) for source in log.sources if source.sensor.use]
     unused = [SensorData(source.sensor, (), {}, {}) for source in log.sources if not source.sensor.use]
@@ -98,7 +97,7 @@ def examine(manifest: Path, data: Path | None = None) -> LogCheck:
 
 
 def check_sensor(data: SensorData) -> Iterator[Finding]:
-    """Rows that are refused, stamps that stand, gaps, fixes that repeat."""
+    """Refused rows, frozen stamps, gaps, repeated fixes."""
     name, stamps = data.sensor.name, data.stamps_ns
     if data.problem:
         worst = max(data.refused, key=lambda reason: data.refused[reason], default="")
@@ -123,7 +122,7 @@ def check_sensor(data: SensorData) -> Iterator[Finding]:
 
 
 def check_places(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding]:
-    """Fixes that are not on the site."""
+    """Fixes off the site."""
     for one in data:
         if one.readings and _is_receiver(one.sensor):
             far_m = np.abs(places(one.readings, log.site)[1]).max(axis=1)
@@ -134,19 +133,19 @@ def check_places(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding
 
 
 def check_speeds(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding]:
-    """Wheels against fixes: units."""
+    """Wheels against fixes, to find wrong units."""
     fixes = next((one for one in data if len(one.readings) > 1 and _is_receiver(one.sensor)), None)
     for one in data:
         if fixes and len(one.readings) > 1 and one.sensor.kind in WHEELS:
             share = wheel_share(places(fixes.readings, log.site), wheel_distance(one.readings, log.machine))
-            if not 1 / UNIT < share < UNIT and share >= 0:  # NaN of a machine that stands
+            if not 1 / UNIT < share < UNIT and share >= 0:  # NaN: the machine stands
                 what = f"the wheels turn {share:.2g} times as far as {fixes.sensor.name} goes"
                 advice = "look at the unit of the speed, `wheel_radius_m`, `ticks_per_rev`"
                 yield Finding(Level.WARN, one.sensor.name, what, advice)
 
 
 def check_positions(data: Sequence[SensorData], *, is_barred: bool) -> Finding:
-    """Whether the sensors in use can locate the machine. is_barred: their clocks or places do not fit together."""
+    """Whether the sensors in use can locate the machine. is_barred: clocks or places are inconsistent."""
     there = [one.sensor for one in data if one.readings and one.sensor.kind in QUANTITIES]
     kinds, problem, advice = {sensor.kind for sensor in there}, "", ""
     if not any(_is_receiver(sensor) for sensor in there):
@@ -167,7 +166,7 @@ def check_positions(data: Sequence[SensorData], *, is_barred: bool) -> Finding:
 
 
 def missing_for_ground(machine: MachineConfig, areas: Sequence[KnownArea]) -> str:
-    """Why no ground can be compared, empty where it can."""
+    """Why ground cannot be compared; empty if it can."""
     used = [sensor for sensor in machine.sensors if sensor.use]
     if not any(sensor.kind == Imu.kind and sensor.provides("force") for sensor in used):
         return "no IMU with forces, which gradient and rolling resistance need"
@@ -179,14 +178,14 @@ def missing_for_ground(machine: MachineConfig, areas: Sequence[KnownArea]) -> st
 
 
 def missing_for_truth(truth: LogTruth | None) -> str:
-    """Why positions cannot be compared with a truth, empty where they can."""
+    """Why positions cannot be compared with a truth; empty if they can."""
     if truth:
         return ""
     return f"no true track is known; describe one as [truth] in {SIDE_FILE} beside the manifest ({PAGE})"
 
 
 def _compared(log: LogFolder, folder: Path, first_ns: int, last_ns: int) -> Iterator[Finding]:
-    """What can be compared with a truth and with known ground."""
+    """Comparisons possible with truth and known ground."""
     try:
         truth, areas = read_log_truth(log, folder), read_known_ground(log, folder)
         if truth:
@@ -202,7 +201,6 @@ def _compared(log: LogFolder, folder: Path, first_ns: int, last_ns: int) -> Iter
 
 
 def _read(log: LogFolder, sensor: SensorConfig) -> SensorData:
-    """Read the file of one sensor."""
     sources = tuple(source for source in log.sources if source.sensor == sensor)
     alone = replace(log, sources=sources, refused=Counter(), first_refused={})
     try:
@@ -215,7 +213,7 @@ def _read(log: LogFolder, sensor: SensorConfig) -> SensorData:
 
 
 def _row(data: SensorData, start_ns: int) -> Row:
-    """A line of the table; times count from the first reading of the log."""
+    """A table row; times from the log's first reading."""
     stamps, sensor = data.stamps_ns, data.sensor
     row = {"sensor": sensor.name, "kind": sensor.kind, "usable": len(stamps), "refused": sum(data.refused.values())}
     figures: dict[str, float | int | None] = dict.fromkeys(("begins_s", "ends_s", "rate_hz", "gaps", "longest_gap_s"))
@@ -230,12 +228,11 @@ def _row(data: SensorData, start_ns: int) -> Row:
 
 
 def _gaps(steps_s: Floats) -> Floats:
-    """Intervals that are far longer than the usual one."""
     return steps_s[steps_s > max(PAUSE * float(np.median(steps_s)), LEAST_GAP_S)]
 
 
 def _repeated(readings: Sequence[Reading]) -> tuple[float, float]:
-    """Share of fixes at the very place of the one before, and for how long the longest stays there [s]."""
+    """Share of fixes equal to the previous one, and the longest such time [s]."""
     fixes = [reading for reading in readings if isinstance(reading, Gps)]
     held = [list(group) for _, group in groupby(fixes, key=attrgetter("lat_deg", "lon_deg"))]
     longest_ns = max((group[-1].stamp_ns - group[0].stamp_ns for group in held), default=0)

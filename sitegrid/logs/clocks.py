@@ -1,4 +1,4 @@
-"""Clocks of a log's sensors that are apart: by how much, and what to write into its manifest."""
+"""Clock offsets between a log's sensors, and the manifest lines that correct them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ ALL_DIGITS = "export the time column with all its digits"
 
 
 def stands(stamps: Ints) -> bool:
-    """Whether most of these stamps (n,) equal the one before, as a spreadsheet leaves them."""
+    """Whether most stamps (n,) repeat, as spreadsheets leave them."""
     return len(stamps) > 1 and bool((np.diff(stamps) == 0).mean() > 1 / 2)
 
 
 def check_clocks(log: LogFolder, readings: Mapping[str, Sequence[Reading]]) -> Iterator[Finding]:
-    """Sensors whose clock is not that of the others. readings: by sensor, in the order of their file.
+    """Sensors with a deviating clock. readings: by sensor, in file order.
 
-    FAIL where a sensor's stamps overlap with those of no other: nothing can be made of it.
+    FAIL if a sensor's stamps overlap with no other's, which makes it useless.
     """
     spans = {name: (rows[0].stamp_ns, rows[-1].stamp_ns) for name, rows in readings.items() if rows}
     offsets = _offsets(log, readings, spans)
@@ -44,7 +44,7 @@ def check_clocks(log: LogFolder, readings: Mapping[str, Sequence[Reading]]) -> I
 def _offsets(
     log: LogFolder, readings: Mapping[str, Sequence[Reading]], spans: Mapping[str, tuple[int, int]]
 ) -> dict[str, Offset]:
-    """Offsets by sensor; one that shows no motion has that of the sensor whose clock it seems to share."""
+    """Offsets by sensor; a sensor without motion takes that of the sensor with the same apparent clock."""
     clocks = ClockOffsets(log.machine, log.site)
     for rows in readings.values():
         clocks.take(rows)
@@ -59,7 +59,7 @@ def _offsets(
 
 
 def time_of(stamp_ns: int) -> str:
-    """A stamp as people read it."""
+    """A stamp for people."""
     return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 

@@ -1,8 +1,8 @@
-"""Whether errors are as large as their covariances say: NEES, NIS, the 95 % ellipse, whiteness of innovations.
+"""Whether errors fit their covariances: NEES, NIS, 95 % ellipse, whiteness of innovations.
 
-NEES is e' P^-1 e of an estimate's error, NIS the same of an innovation with its covariance S. Of a consistent filter
-both are chi-square distributed with as many degrees of freedom as the vector has components (Bar-Shalom, Li,
-Kirubarajan, "Estimation with Applications to Tracking and Navigation", 5.4).
+NEES is e' P^-1 e of an estimate's error; NIS the same of an innovation with covariance S. For a consistent filter both
+are chi-square, with the vector's dimension as degrees of freedom (Bar-Shalom, Li, Kirubarajan, "Estimation with
+Applications to Tracking and Navigation", 5.4).
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from sitegrid.proof.figures import CONFIDENCE
 
 @dataclass(frozen=True)
 class ConsistencySummary:
-    """Figures of a series of NEES or NIS.
+    """Summary of a NEES or NIS series.
 
-    mean: [-], of a consistent filter close to `dof`, above it where the covariance is too small. low, high: interval
-    that holds the mean of a consistent filter in 95 of 100 cases. coverage: share inside of the 95 % ellipse.
-    independent: how many independent values the series is worth.
+    mean: [-], near `dof` if consistent, above it if the covariance is too small. low, high: 95 % interval of a
+    consistent filter's mean. coverage: share inside the 95 % ellipse. independent: effective sample size.
     """
 
     dof: int
@@ -35,17 +34,16 @@ class ConsistencySummary:
 
 
 def normalised_square(vectors: Floats, covariances: Floats) -> Floats:
-    """NEES of errors, or NIS of innovations: vectors (n, k), covariances (n, k, k) -> (n,)."""
+    """NEES or NIS of vectors (n, k) with covariances (n, k, k) -> (n,)."""
     solved = np.linalg.solve(covariances, vectors[:, :, None])[:, :, 0]
     squares: Floats = np.einsum("nk,nk->n", vectors, solved)
     return squares
 
 
 def summarise(squares: Floats, dof: int, independent: float | None = None) -> ConsistencySummary:
-    """Summarise a series (n,) of NEES or NIS in the order of time.
+    """Summarise a NEES or NIS series (n,), in time order.
 
-    independent: how many independent values it is worth; by default its autocorrelation says so. The interval takes
-    their sum as chi-square distributed.
+    independent: effective sample size, by default from the autocorrelation. The interval takes the sum as chi-square.
     """
     if not len(squares):
         return ConsistencySummary(dof, math.nan, math.nan, math.nan, math.nan, 0.0)
@@ -56,22 +54,22 @@ def summarise(squares: Floats, dof: int, independent: float | None = None) -> Co
 
 
 def mean_interval(dof: int, independent: float) -> tuple[float, float]:
-    """Interval that holds the mean of so many independent chi-square values in 95 of 100 cases."""
+    """95 % interval of the mean of `independent` chi-square values."""
     tail = (1 - CONFIDENCE) / 2
     low, high = stats.chi2.ppf([tail, 1 - tail], dof * independent) / independent
     return float(low), float(high)
 
 
 def ellipse_limit(dof: int) -> float:
-    """Squared Mahalanobis radius of the ellipse that holds 95 % of a Gaussian distribution."""
+    """Squared Mahalanobis radius of a Gaussian's 95 % ellipse."""
     return float(stats.chi2.ppf(CONFIDENCE, dof))
 
 
 def independent_values(series: Floats) -> float:
-    """How many independent values a stationary series (n,) is worth, at least 1: n over its autocorrelation time.
+    """Effective sample size of a stationary series (n,), at least 1: n over its autocorrelation time.
 
-    Errors of a position last for minutes; without this the interval of a NEES at 10 Hz would be absurdly narrow. The
-    autocorrelation is summed up to where its pairs fall to zero (Geyer 1992, initial positive sequence).
+    Position errors last for minutes; ignoring that makes the interval of a 10 Hz NEES absurdly narrow. The
+    autocorrelation is summed until its pairs reach zero (Geyer 1992, initial positive sequence).
     """
     correlation = autocorrelation(series)
     if correlation is None:
@@ -83,7 +81,7 @@ def independent_values(series: Floats) -> float:
 
 
 def autocorrelation(series: Floats) -> Floats | None:
-    """Autocorrelation (n,) of a series at lags 0 to n - 1, None of a constant one."""
+    """Autocorrelation (n,) at lags 0 to n - 1; None for a constant series."""
     n = len(series)
     centred = series - series.mean()
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2

@@ -1,6 +1,6 @@
-"""The ground that a recording shows, against areas where it is known.
+"""A recording's ground against areas of known ground.
 
-The machine is not told the site's known ground here: it would calibrate itself on what it is compared with.
+The site's known ground is hidden here, else the machine would calibrate on its own reference.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from sitegrid.logs.log_truth import KnownArea
 from sitegrid.logs.replay import spans
 from sitegrid.proof.figures import Row, half_width, root_mean_square, rounded
 
-AWAY_NS = 5 * 10**9  # without a sample inside: the next one begins another pass
-# What is compared: the columns of a sample, and of its variance.
+AWAY_NS = 5 * 10**9  # without samples inside, the next one starts a new pass
+# Compared sample columns, and their variances.
 FIGURES = {
     "c_rr": ("c_rr", "c_rr_var"),
     "grade_east": ("grade_e", "grade_var"),
@@ -31,19 +31,18 @@ FIGURES = {
 
 
 def samples_of(log: LogFolder, options: LocalisationConfig, readings: Sequence[Reading]) -> Table:
-    """The samples that the machine's agent would have sent, at their smoothed places."""
+    """Samples as the machine's agent would send them, at smoothed places."""
     config = PipelineConfig(localisation=options)
     pipeline = Pipeline(replace(log.site, known_ground=()), log.machine, config)
     return joined([*(pipeline.step(span).final for span in spans(readings)), pipeline.finish().final])
 
 
 def compare(samples: Table, areas: Sequence[KnownArea]) -> list[Row]:
-    """A row per area and figure that is known of it.
+    """One row per area and known figure.
 
-    mean: weighted by metres driven; off: mean minus known; spread: standard deviation of the samples; mean_95: half
-    the 95 % interval of the mean, by how far single passes are apart, None of one pass; rms: of the samples' errors;
-    std: rms of the standard deviations that they state. Samples count that lie inside by more than the standard
-    deviation of their position.
+    mean: weighted by distance. off: mean minus known. spread: samples' standard deviation. mean_95: half the mean's 95
+    % interval from the scatter of passes, None for one pass. rms: of sample errors. std: rms of stated standard
+    deviations. Samples count if inside by more than their position's standard deviation.
     """
     rows = []
     for area in areas:

@@ -1,12 +1,12 @@
-"""What is known of a recording beside its readings: `evaluation.toml` beside the manifest, which agents never read.
+"""Reference of a recording: `evaluation.toml` beside the manifest, never read by agents.
 
-[truth]                                # the true track of the log, of `base_link` or of an antenna
-file = "truth.csv.gz"                  # in the data folder; keys and columns as those of a sensor in the manifest
-mount = { xyz_m = [0.4, 0.0, 1.9] }    # where that antenna sits; default at `base_link`
+[truth]                                # true track of `base_link` or an antenna
+file = "truth.csv.gz"                  # in the data folder; keys and columns like a sensor's in the manifest
+mount = { xyz_m = [0.4, 0.0, 1.9] }    # that antenna's mount; default `base_link`
 stamp = "t"
 x_m = "x"                              # metres in `map`; or lat_deg and lon_deg
 y_m = "y"
-[[ground]]                             # an area whose rolling resistance, gradient, or both are known
+[[ground]]                             # area of known resistance, gradient, or both
 name = "ramp"
 outline = [[0.0, 0.0], [20.0, 0.0], [20.0, 15.0]]    # corners in `map` [m]
 c_rr = 0.012
@@ -49,12 +49,12 @@ from sitegrid.proof.tracks import Truth
 SIDE_FILE = "evaluation.toml"
 PLANAR, GEODETIC = ("x_m", "y_m"), ("lat_deg", "lon_deg")
 LIMITS = {"x_m": MAX_FAR_M, "y_m": MAX_FAR_M, "lat_deg": 90.0, "lon_deg": 180.0}
-GAP_NS = 2_000_000_000  # between two rows that are further apart nobody knows where the machine was
+GAP_NS = 2_000_000_000  # between rows farther apart the position is unknown
 
 
 @dataclass(frozen=True)
 class LogTruth:
-    """The true track of a log; lever_m (3,): where in `base_link` the point is whose track it is."""
+    """True track of a log; lever_m (3,): the tracked point in `base_link`."""
 
     track: Truth
     lever_m: Floats
@@ -62,7 +62,7 @@ class LogTruth:
 
 @dataclass(frozen=True)
 class KnownArea:
-    """An area whose ground is known; what is not known of it is None.
+    """Area with known ground; None: unknown.
 
     outline: corners in `map` [m]. c_rr: rolling resistance [-]. grade_east, grade_north: rise over run.
     """
@@ -74,7 +74,7 @@ class KnownArea:
     grade_north: float | None = None
 
     def __post_init__(self) -> None:
-        self.inside_m(0.0, 0.0)  # refuses an outline that is no area, and a resistance that is none
+        self.inside_m(0.0, 0.0)  # refuses an invalid outline or resistance
         if self.c_rr is None and not self.has_gradient:
             raise ValueError(f"{self.name}: state c_rr, grade_east or grade_north, else nothing is known of it")
 
@@ -84,18 +84,18 @@ class KnownArea:
         return self.grade_east is not None or self.grade_north is not None
 
     def inside_m(self, x_m: float, y_m: float) -> float:
-        """How far inside of the outline a place lies [m]; negative outside."""
+        """Distance inside the outline [m], negative outside."""
         return KnownGround(self.name, self.c_rr or 0.0, self.outline).inside_m(x_m, y_m)
 
 
 def read_log_truth(log: LogFolder, folder: Path) -> LogTruth | None:
-    """The true track that the side file in a folder describes, None without one."""
+    """The true track from a folder's side file, or None."""
     described = section(_side_file(folder), "truth", str(folder / SIDE_FILE))
     return _read(log, described, f"{folder / SIDE_FILE} [truth]") if described else None
 
 
 def require_overlap(truth: LogTruth, first_ns: int, last_ns: int) -> None:
-    """Refuse a truth that lasts at another time than the readings, from first_ns to last_ns; raises ConfigError."""
+    """ConfigError if the truth does not overlap readings from first_ns to last_ns."""
     begins_s, ends_s = (float(truth.track.stamp_ns[i] - first_ns) * 1e-9 for i in (0, -1))
     seconds = (last_ns - first_ns) * 1e-9
     if ends_s < 0 or begins_s > seconds:
@@ -104,7 +104,7 @@ def require_overlap(truth: LogTruth, first_ns: int, last_ns: int) -> None:
 
 
 def read_known_ground(log: LogFolder, folder: Path) -> tuple[KnownArea, ...]:
-    """Areas of known ground, of the side file in a folder and of the site."""
+    """Areas of known ground from side file and site."""
     of_site = [KnownArea(area.name, area.outline, area.c_rr) for area in log.site.known_ground]
     described = from_table(_Ground, {"ground": _side_file(folder).get("ground", [])}, str(folder / SIDE_FILE))
     return *described.ground, *of_site
@@ -112,13 +112,13 @@ def read_known_ground(log: LogFolder, folder: Path) -> tuple[KnownArea, ...]:
 
 @dataclass(frozen=True)
 class _Ground:
-    """The side file's [[ground]]."""
+    """[[ground]] tables."""
 
     ground: tuple[KnownArea, ...] = ()
 
 
 def _side_file(folder: Path) -> dict[str, Any]:
-    """The tables of the side file, none without one."""
+    """Tables of the side file, empty without one."""
     where = folder / SIDE_FILE
     table = load_toml(where) if where.is_file() else {}
     if unknown := [name for name in table if name not in ("truth", "ground")]:
@@ -146,7 +146,7 @@ def _read(log: LogFolder, described: dict[str, Any], where: str) -> LogTruth:
 def _rows(
     log: LogFolder, file: CsvFile, time: Column, pair: Mapping[str, Column]
 ) -> Iterator[tuple[int, float, float]]:
-    """Stamp and place of each row that counts, NaN where a row says so; raises LogFolderError with the line."""
+    """Stamp and place per usable row, NaN where stated; LogFolderError names the line."""
     path, newest = log.data / file.file, 0
     stamp = stamp_reader(time, log.start_ns)
     readers = [number_reader(column, name) for name, column in pair.items()]
@@ -175,7 +175,7 @@ def _rows(
 
 
 def _cut_at_gaps(stamps: Ints, places: Floats) -> Truth:
-    """The track, with nothing known between rows that are far apart: a receiver was lost there."""
+    """The track with NaN inside gaps, where the receiver was lost."""
     gaps = np.flatnonzero(np.diff(stamps) > GAP_NS)
     middles = stamps[gaps] + np.diff(stamps)[gaps] // 2
     return Truth(np.insert(stamps, gaps + 1, middles), np.insert(places, gaps + 1, math.nan, axis=0))

@@ -1,4 +1,4 @@
-"""A picture of a replayed log: the track as it was believed, its 95 % ellipses, fixes and truth, axes in metres."""
+"""Picture of a replayed log: estimated track, 95 % ellipses, fixes, truth; axes in metres."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sitegrid.logs.speeds import places
 from sitegrid.proof.figures import root_mean_square
 
 MAX_SIDE_PX, MAX_PX_PER_M, MARGIN_M = 1000, 20.0, 5.0
-ELLIPSES = 60  # drawn along a track; more would hide it
+ELLIPSES = 60  # per track
 BLANK: Colour = (255, 255, 255)
 FIX: Colour = (190, 190, 190)
 WITHHELD: Colour = (60, 160, 250)
@@ -35,7 +35,7 @@ def draw_log(path: Path, recording: Recording, pattern: Pattern, trace: Trace) -
 
 
 def picture(recording: Recording, pattern: Pattern, trace: Trace) -> Image:
-    """Draw a replay; with a truth, the track is that of the point whose truth it is."""
+    """Draw a replay; with a truth, the track of the truth's point."""
     truth = recording.truth
     seconds, fixes = places(recording.readings, recording.log.site)
     begin_s = recording.readings[0].stamp_ns * 1e-9
@@ -64,7 +64,7 @@ def _rms_m(track: Track, recording: Recording) -> float:
 
 
 def _usual(fixes: Floats) -> Floats:
-    """Fixes without the strays, which would make the rest small."""
+    """Fixes without outliers, which would shrink the rest."""
     if not len(fixes):
         return fixes
     low, high = np.percentile(fixes, (1, 99), axis=0)
@@ -73,7 +73,7 @@ def _usual(fixes: Floats) -> Floats:
 
 
 def _axes(lines: Sequence[Floats]) -> Axes:
-    """The part of `map` that holds these places (n, 2), and a scale that fits a screen."""
+    """Bounds of these places (n, 2), and a scale for a screen."""
     points = np.concatenate(lines)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(2), np.zeros(2))
@@ -89,7 +89,7 @@ def _blank(axes: Axes) -> Image:
 
 
 def _pixels(ground: Image, axes: Axes, places: Floats) -> Ints:
-    """Places (n, 2) as pixels with four binary places, as OpenCV draws them."""
+    """Places (n, 2) as OpenCV's fixed-point pixels, four fractional bits."""
     x = (places[:, 0] - axes.bounds.west_m) * axes.px_per_m
     y = ground.shape[0] - (places[:, 1] - axes.bounds.south_m) * axes.px_per_m
     pixels: Ints = np.rint(np.clip(np.stack([x, y], axis=1), -1e6, 1e6) * 16).astype(np.int32)
@@ -102,7 +102,6 @@ def _dots(ground: Image, axes: Axes, places: Floats, colour: Colour) -> None:
 
 
 def _line(ground: Image, axes: Axes, places: Floats, colour: Colour, thickness: int) -> None:
-    """A line that NaN breaks."""
     known = np.isfinite(places).all(axis=1)
     pieces = [piece for piece in np.split(places, np.flatnonzero(~known)) if len(piece)]
     lines = [_pixels(ground, axes, piece[np.isfinite(piece).all(axis=1)]) for piece in pieces]
@@ -110,7 +109,7 @@ def _line(ground: Image, axes: Axes, places: Floats, colour: Colour, thickness: 
 
 
 def _ellipses(ground: Image, axes: Axes, track: Track) -> None:
-    """95 % ellipses, evenly along the track."""
+    """95 % ellipses evenly along the track."""
     every = max(1, len(track.stamp_ns) // ELLIPSES)
     variances, directions = np.linalg.eigh(track.covariance_m2[::every])
     radii = np.sqrt(ellipse_limit(2) * np.maximum(variances, 0)) * axes.px_per_m * 16

@@ -1,7 +1,7 @@
-"""Replay readings through the pipeline, or through its localising half, and compare its poses with the truth.
+"""Replay readings through the pipeline, or localisation alone, and compare poses with the truth.
 
-A pose is compared at its own stamp, as it was known after the readings of that 100 ms: no later reading improves it.
-Smoothed poses are what later readings made of it: they are compared at their own stamps too, once a second.
+A pose is compared at its stamp, as known after that 100 ms of readings. Smoothed poses, improved by later readings, are
+compared at their stamps once a second.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from sitegrid.proof.figures import root_mean_square
 from sitegrid.proof.tracks import Truth
 
 STEP_NS = 100_000_000
-HOLE = 3  # times the usual interval between poses: nothing was believed in a longer one
+HOLE = 3  # usual pose intervals; longer ones are gaps
 
 
 @dataclass(frozen=True)
 class Track:
-    """Where a machine is said to have been.
+    """Estimated track of a machine.
 
     stamp_ns: (n,); position_m: (n, 2), covariance_m2: (n, 2, 2), heading_rad: (n,) in `map`.
     """
@@ -42,9 +42,9 @@ class Track:
     heading_rad: Floats
 
     def moved(self, lever_m: Floats) -> Self:
-        """Of another point of the machine, lever_m (3,) off in `base_link`, as a machine on the plane has it.
+        """The track of another point, lever_m (3,) off in `base_link`, machine level.
 
-        The covariance stays: what the heading adds, its standard deviation times the lever, is small beside it.
+        The covariance is kept: heading error times lever is negligible.
         """
         c, s, (ahead, left, _) = np.cos(self.heading_rad), np.sin(self.heading_rad), lever_m
         off = np.stack([c * ahead - s * left, s * ahead + c * left], axis=1)
@@ -56,10 +56,10 @@ NOWHERE = Track(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), np
 
 @dataclass(frozen=True)
 class Trace(Track):
-    """What was believed, once per STEP_NS from the first pose on.
+    """Estimates as of their time, one per STEP_NS from the first pose.
 
-    first_ns, last_ns: of the readings. cpu_s: processor time of whatever was run: the whole pipeline, or localisation
-    alone. smoothed: what localisation alone says of the past in the end; empty of a pipeline, or without a smoother.
+    first_ns, last_ns: of the readings. cpu_s: of the replay, pipeline or localisation alone. smoothed: of localisation
+    alone; else empty.
     """
 
     first_ns: int
@@ -69,26 +69,26 @@ class Trace(Track):
 
     @property
     def seconds(self) -> float:
-        """How long the readings last."""
+        """Duration of the readings."""
         return (self.last_ns - self.first_ns) * 1e-9
 
     @property
     def since_start_s(self) -> Floats:
-        """Stamps (n,) as seconds after the first reading."""
+        """Stamps (n,) in seconds after the first reading."""
         return np.asarray(self.stamp_ns - self.first_ns, float) * 1e-9
 
     def moved(self, lever_m: Floats) -> Self:
-        """Of another point of the machine, as of any track."""
+        """The trace of another point."""
         return replace(super().moved(lever_m), smoothed=self.smoothed.moved(lever_m))
 
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of one run, counted from its first pose on.
+    """Errors of one run from its first pose.
 
-    rmse_x_m, rmse_y_m, net_m: root mean squares; net is that of the distance. nees: mean, 2 where the covariance is
-    right; nees_low, nees_high: its 95 % interval then. coverage95: share of time that the 95 % ellipse holds the truth.
-    covered: share of time with a pose, as `covered` has it. us_per_second: processor time [us] per second of readings.
+    rmse_x_m, rmse_y_m, net_m: root mean squares; net: of the distance. nees: mean, 2 if consistent; nees_low,
+    nees_high: its 95 % interval if consistent. coverage95: share of time with the truth in the 95 % ellipse. covered:
+    see `covered`. us_per_second: processor time [us] per second of readings.
     """
 
     rmse_x_m: float
@@ -107,7 +107,7 @@ class Score:
 
 
 def replay(core: PoseSource, readings: Sequence[Reading], holdout: Holdout | None = None) -> Trace:
-    """Give readings to a pipeline or to its localising half, in the order of their stamps; holdout keeps fixes back."""
+    """Replay readings by stamp into a pipeline or localisation alone; holdout withholds fixes."""
     poses: list[PoseBelief] = []
     smoothed: list[SmoothedPose] = []
     cpu_s = 0.0
@@ -131,12 +131,12 @@ def replay(core: PoseSource, readings: Sequence[Reading], holdout: Holdout | Non
 
 
 def errors(track: Track, truth: Truth) -> Floats:
-    """Errors (n, 2) [m] of a track; NaN where the truth is not known."""
+    """Errors (n, 2) [m] of a track; NaN where the truth is unknown."""
     return track.position_m - truth.at(track.stamp_ns)
 
 
 def score(trace: Trace, truth: Truth) -> Score:
-    """Errors of a trace, NaN where it has none."""
+    """Errors of a trace; NaN if empty."""
     off, nees = _judged(trace, truth)
     smoothed_off, smoothed_nees = _judged(trace.smoothed, truth)
     x, y = (root_mean_square(column) for column in off.T)
@@ -158,7 +158,7 @@ def score(trace: Trace, truth: Truth) -> Score:
 
 
 def _judged(track: Track, truth: Truth) -> tuple[Floats, ConsistencySummary]:
-    """Errors (m, 2) of a track where the truth is known, and its NEES."""
+    """Errors (m, 2) where the truth is known, and their NEES."""
     off = errors(track, truth)
     known = np.isfinite(off).all(axis=1)
     off = off[known]
@@ -175,10 +175,9 @@ def _track(poses: Sequence[PoseBelief] | Sequence[SmoothedPose]) -> Track:
 
 
 def covered(trace: Trace) -> float:
-    """Share of the time of the readings with a pose, at the log's own rate; 0 to 1.
+    """Share of the readings' time with a pose, 0 to 1, at the log's own rate.
 
-    The time between two poses counts, and that from the first reading and to the last one; of a hole, one usual
-    (median) interval.
+    All intervals count, including those before the first and after the last pose; of a gap only one median interval.
     """
     if not len(trace.stamp_ns):
         return 0.0
@@ -190,7 +189,7 @@ def covered(trace: Trace) -> float:
 
 
 def spans(readings: Sequence[Reading]) -> Iterator[list[Reading]]:
-    """Cut readings at the multiples of STEP_NS; one whose stamp goes back stays with those that it came with."""
+    """Split readings at multiples of STEP_NS; a late reading stays in the span it arrived in."""
     span: list[Reading] = []
     step = 0
     for reading in readings:

@@ -1,4 +1,4 @@
-"""A recording replayed: its positions against withheld fixes and the truth, its ground against known ground."""
+"""Replay a recording: positions against withheld fixes and truth, ground against known ground."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ NO_POSE = "no pose, as the heading never showed: that takes wheels, fixes and 12
 
 @dataclass(frozen=True)
 class Recording:
-    """A log, its readings, and what is known beside them."""
+    """A log, its readings, and known references."""
 
     log: LogFolder
     readings: Sequence[Reading]
@@ -75,10 +75,10 @@ def run(
     on_progress: Callable[[str], None] = lambda _: None,
     draw: Draw | None = None,
 ) -> Report:
-    """Replay a log once per pattern of withheld GPS, and once more for its ground where some is known.
+    """Replay a log per withholding pattern, and once more if ground is known.
 
-    draw: is given the trace of the first pattern. refused: readings by reason, and where the first of each stands.
-    missing: what cannot be compared, and why not. clocks: which are apart, a sentence each.
+    draw: gets the first pattern's trace. In the report: refused: readings by reason, and the first place of each;
+    missing: impossible comparisons and why; clocks: deviating clocks, a sentence each.
     """
     log = recording.log
     require_place(log.machine, options)
@@ -107,7 +107,7 @@ def run(
 
 
 def _clocks(recording: Recording) -> list[str]:
-    """Which clocks are apart, a sentence each."""
+    """Deviating clocks, a sentence each."""
     readings: dict[str, list[Reading]] = {}
     for reading in recording.readings:
         readings.setdefault(reading.sensor, []).append(reading)
@@ -116,7 +116,7 @@ def _clocks(recording: Recording) -> list[str]:
 
 
 def _described(recording: Recording, options: LocalisationConfig) -> Report:
-    """What is replayed: the log, its sensors, its readings."""
+    """Facts of the replay: log, sensors, readings."""
     log = recording.log
     return {
         "log": log.name,
@@ -131,7 +131,7 @@ def _described(recording: Recording, options: LocalisationConfig) -> Report:
 
 
 def measurements(rows: Sequence[Row]) -> list[Row]:
-    """Of each row and sensor: measurements that the filter used and refused, and how consistent it is with fixes."""
+    """Per row and sensor: measurements used and refused, and consistency with fixes."""
     listed = []
     for row in rows:
         counters = row["counters"]
@@ -144,12 +144,12 @@ def measurements(rows: Sequence[Row]) -> list[Row]:
 
 
 def receivers(machine: MachineConfig) -> int:
-    """How many GPS receivers are in use."""
+    """Number of GPS receivers in use."""
     return sum(sensor.use and sensor.kind == "gps" for sensor in machine.sensors)
 
 
 def _require_time(recording: Recording, patterns: Sequence[Pattern]) -> None:
-    """Refuse an outage behind the log's end."""
+    """Refuse outages after the log's end."""
     seconds = (recording.readings[-1].stamp_ns - recording.readings[0].stamp_ns) * 1e-9
     for pattern in patterns:
         if isinstance(pattern, Outage) and pattern.start_s >= seconds:
@@ -157,9 +157,9 @@ def _require_time(recording: Recording, patterns: Sequence[Pattern]) -> None:
 
 
 def _row(recording: Recording, options: LocalisationConfig, pattern: Pattern) -> tuple[Row, Trace]:
-    """Errors [m] against the withheld fixes, and against the truth if known; and the trace that has them.
+    """Errors [m] against withheld fixes, and a known truth; and their trace.
 
-    Errors of periodic outages count from `agents.holdout.SETTLE_S` on, those of a placed one all.
+    Periodic outages count from `agents.holdout.SETTLE_S` on, placed ones entirely.
     """
     log, truth = recording.log, recording.truth
     settle = {"settle_s": 0.0} if isinstance(pattern, Outage) else {}
@@ -181,7 +181,7 @@ def _row(recording: Recording, options: LocalisationConfig, pattern: Pattern) ->
 
 
 def _against_truth(trace: Trace, truth: Truth, pattern: Pattern) -> Row:
-    """Errors from the first pose on; truth_withheld_m: of the times without GPS; truth_end_m: of the last of each."""
+    """Errors from the first pose; truth_withheld_m: during outages; truth_end_m: at their ends."""
     scored = score(trace, truth)
     off = np.hypot(*errors(trace, truth).T)
     dark = np.array([pattern is not None and pattern.withholds(s) for s in trace.since_start_s], bool)

@@ -1,4 +1,4 @@
-"""Which of a machine's sensors are used."""
+"""Selection of a machine's sensors."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from protocol.machine.machine_config import MachineConfig
 
 
 class UnsupportedError(SitegridError):
-    """The pipeline cannot run a configuration; the message says why."""
+    """A configuration that the pipeline cannot run; the message says why."""
 
 
 def select(machine: MachineConfig, gps: int | None = None, imu: int | None = None) -> MachineConfig:
-    """Use the first receivers, and the first IMUs with an orientation of each; None leaves them as they are.
+    """Use the first `gps` receivers, and the first `imu` IMUs and attitude sensors; None: unchanged.
 
     Raises UnsupportedError.
     """
@@ -34,7 +34,7 @@ def select(machine: MachineConfig, gps: int | None = None, imu: int | None = Non
 
 
 def chosen(machine: MachineConfig, sensors: Collection[str] = (), gps: int | Collection[str] = ()) -> MachineConfig:
-    """The machine with these sensors in use and no others, and of its receivers so many, or these; empty: as it is."""
+    """The machine with only these sensors, and this number or these of its receivers; empty: unchanged."""
     if sensors:
         machine = _using(machine, sensors, [s.name for s in machine.sensors])
     if isinstance(gps, int):
@@ -43,14 +43,14 @@ def chosen(machine: MachineConfig, sensors: Collection[str] = (), gps: int | Col
 
 
 def refitted(log: LogFolder, machine: MachineConfig) -> LogFolder:
-    """The log with the sensors of this machine, of which others may be in use."""
+    """The log with this machine's choice of sensors in use."""
     sensors = {sensor.name: sensor for sensor in machine.sensors}
     sources = tuple(replace(source, sensor=sensors[source.sensor.name]) for source in log.sources)
     return replace(log, machine=machine, sources=sources)
 
 
 def _using(machine: MachineConfig, names: Collection[str], among: Sequence[str]) -> MachineConfig:
-    """The machine with only some of these sensors in use; the others stay as they are."""
+    """The machine with only `names` of `among` in use; other sensors are unchanged."""
     if unknown := [name for name in names if name not in among]:
         raise ConfigError(machine.name, f"has no {unknown[0]!r}, but {', '.join(among) or 'no receiver'}")
     sensors = (replace(s, use=s.name in names) if s.name in among else s for s in machine.sensors)

@@ -1,6 +1,6 @@
-"""How fast a machine was by its fixes and by its wheels: where they disagree, a wheel sensor is wrong.
+"""A machine's speed by fixes and by wheels; a mismatch shows a wrong wheel sensor.
 
-Both speeds are the distance over WINDOW_S, so that the noise of fixes averages out and stops count in both.
+Both are distances over WINDOW_S: that averages the noise of fixes, and stops count in both.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from protocol.machine.readings import Encoder, Gps, Odometry, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
 STEP_S, WINDOW_S = 0.2, 3.0
-STANDS_MPS = 0.05  # of wheels
+STANDS_MPS = 0.05  # for wheels
 
 
 def wheel_share(fixes: tuple[Floats, Floats], wheels: tuple[Floats, Floats]) -> float:
-    """Distance by the wheels over distance by the fixes where both move; NaN of a short log, and where either stands.
+    """Wheel distance over fix distance where both move; NaN for short logs, or if either stands.
 
     fixes: (n,) [s], (n, 2) [m]. wheels: stamps and distance, (m,) [s], (m,) [m].
     """
@@ -30,19 +30,19 @@ def wheel_share(fixes: tuple[Floats, Floats], wheels: tuple[Floats, Floats]) -> 
     if len(times) * STEP_S < 2 * WINDOW_S:
         return math.nan
     by_fixes, by_wheels = _speed(times, *fixes), _speed(times, wheels[0], wheels[1][:, None])
-    moves = (by_fixes > DRIVES_MPS) & (by_wheels > STANDS_MPS)  # those that stand say nothing of their unit
+    moves = (by_fixes > DRIVES_MPS) & (by_wheels > STANDS_MPS)  # standstill says nothing about units
     return float(by_wheels[moves].sum() / by_fixes[moves].sum()) if moves.any() else math.nan
 
 
 def places(readings: Sequence[Reading], site: SiteConfig) -> tuple[Floats, Floats]:
-    """Stamps (n,) [s] and places (n, 2) in `map` [m] of the fixes among readings."""
+    """Stamps (n,) [s] and places (n, 2) in `map` [m] of fixes."""
     fixes = [reading for reading in readings if isinstance(reading, Gps)]
     degrees = np.array([(fix.lat_deg, fix.lon_deg) for fix in fixes]).reshape(-1, 2)
     return _seconds(fixes), np.stack(Projection(site).to_map_many(*degrees.T), axis=1)
 
 
 def wheel_distance(readings: Sequence[Reading], machine: MachineConfig) -> tuple[Floats, Floats]:
-    """Stamps (n,) [s] of wheel readings of one sensor, and how far the wheels had rolled by then (n,) [m]."""
+    """Stamps (n,) [s] of one wheel sensor, and distance rolled by then (n,) [m]."""
     seconds = _seconds(readings)
     if not isinstance(readings[0], Encoder):
         speeds = np.array([r.speed_x_mps if isinstance(r, Odometry) else 0.0 for r in readings])
@@ -59,7 +59,7 @@ def _seconds(readings: Sequence[Reading]) -> Floats:
 
 
 def _speed(times: Floats, known_s: Floats, places: Floats) -> Floats:
-    """Speeds (n,) [m/s] at times, by the way over WINDOW_S around them."""
+    """Speeds (n,) [m/s] at times, over WINDOW_S around them."""
     half = WINDOW_S / 2
     ways = [np.interp(times + half, known_s, c) - np.interp(times - half, known_s, c) for c in places.T]
     speeds: Floats = np.linalg.norm(ways, axis=0) / WINDOW_S

@@ -1,4 +1,4 @@
-"""Wheel sensors of a recording, judged as an agent judges them: which did not count, from when until when."""
+"""A recording's wheel sensors, judged as by an agent: which were excluded, and when."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOOK_NS = 10**9
 
 
 def check_wheels(log: LogFolder, readings: Sequence[Sequence[Reading]]) -> Iterator[Finding]:
-    """What was wrong with wheels. readings: of each sensor in use, in the order of their stamps."""
+    """Faults of wheels. readings: per sensor in use, by stamp."""
     sensors = {sensor.name: sensor for sensor in log.machine.sensors if sensor.use}
     judge, reckoned = WheelJudge(log.machine, Projection(log.site)), DeadReckoning(log.machine, 0.0)
     first_ns = looked_ns = stamp_ns = 0

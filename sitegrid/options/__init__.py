@@ -1,1 +1,1 @@
-"""Options that commands share, and the values that options take."""
+"""Shared options, and types of option values."""

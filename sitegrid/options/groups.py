@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Options shared by commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Subparsers: TypeAlias = "_SubParsersAction[ArgumentParser]"  # argparse has no p
 
 
 def add_command(commands: Subparsers, name: str, summary: str) -> ArgumentParser:
-    """Add `sitegrid NAME`, with the options of every command."""
+    """Add `sitegrid NAME` with the common options."""
     parser: ArgumentParser = commands.add_parser(name, description=sentence(summary))
     parser.add_argument("--json", action="store_true", help="print JSON for machines")
     parser.add_argument("--verbose", action="store_true", help="log normal events too, not only warnings and errors")
@@ -20,9 +20,9 @@ def add_command(commands: Subparsers, name: str, summary: str) -> ArgumentParser
 
 
 def add_action(actions: Subparsers, name: str, summary: str, description: str | None = None) -> ArgumentParser:
-    """Add the second word of a command, as `point` in `sitegrid query point`."""
+    """Add a command's second word, like `point` in `sitegrid query point`."""
     parser: ArgumentParser = actions.add_parser(name, help=summary, description=description)
-    # without a default, which would overwrite a --json before the second word
+    # a default would overwrite a --json before the second word
     parser.add_argument("--json", action="store_true", default=SUPPRESS, help="print JSON for machines")
     verbose = "log normal events too, not only warnings and errors"
     parser.add_argument("--verbose", action="store_true", default=SUPPRESS, help=verbose)
@@ -30,7 +30,7 @@ def add_action(actions: Subparsers, name: str, summary: str, description: str | 
 
 
 def add_network(parser: ArgumentParser, *, again: bool = False) -> None:
-    """Options of a command that connects to the router. again: after its second word too, so without defaults."""
+    """Options to connect to the router. again: also after the second word, so without defaults."""
     router = f"router to connect to (default {DEFAULT_ENDPOINT})"
     parser.add_argument("--endpoint", default=SUPPRESS if again else DEFAULT_ENDPOINT, help=router)
     keys = "folder with the keys of this process (see `sitegrid keys`); the default endpoint is tls/... then"
@@ -38,7 +38,7 @@ def add_network(parser: ArgumentParser, *, again: bool = False) -> None:
 
 
 def add_site(parser: ArgumentParser, *, again: bool = False) -> None:
-    """The name of the site that is asked; see `connect` where it is not given. again: see `add_network`."""
+    """The site's name; default: see `connect`. again: see `add_network`."""
     site = "name of the site (default: that of the keys, else paper)"
     parser.add_argument("--site", default=SUPPRESS if again else None, help=site)
 

@@ -1,4 +1,4 @@
-"""Options of the command line for the parameters of a query, and the query of what was given."""
+"""Command line options for query parameters, and the resulting query."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from protocol.queries.requests import parse_query
 from sitegrid.options.values import site_time
 from sitegrid.times import HELP
 
-NUMBERS = {ValueForm.PLACE: 2, ValueForm.PLACES: "+", ValueForm.RECTANGLE: 4}  # of a value, each a word of its own
+NUMBERS = {ValueForm.PLACE: 2, ValueForm.PLACES: "+", ValueForm.RECTANGLE: 4}  # words per value
 SIDES = ("W", "S", "E", "N")
 
 
 def add_parameters(parser: ArgumentParser, query: type[MapQuery[Any]], without: Container[str] = ()) -> None:
-    """An option for each parameter of a query, but those that the command adds by itself."""
+    """Add an option per query parameter, except `without`."""
     for one in parameters_of(query).values():
         if one.name not in without:
             _add(parser, one)
     if any(one.kind.form is ValueForm.STAMP for one in parameters_of(query).values()):
         parser.epilog = f"TIME: {HELP}."
-    # argparse knows no public way to say that -2h is a value as -2 is one, not an option
+    # argparse cannot publicly learn that -2h is a value like -2
     parser._negative_number_matcher = re.compile(r"-\.?\d.*")  # noqa: SLF001
 
 
@@ -43,14 +43,14 @@ def _add(parser: ArgumentParser, one: Parameter) -> None:
 
 
 def dest(name: str) -> str:
-    """Where argparse keeps what was given of a parameter."""
+    """Destination of a parameter in argparse."""
     return f"asked_{name}"
 
 
 def given(query: type[MapQuery[Any]], arguments: Namespace, now_ns: Callable[[], int]) -> MapQuery[Any]:
-    """The query that was asked for; QueryError says what is wrong with which parameter.
+    """The query from the options; QueryError names the wrong parameter.
 
-    now_ns: the site's now, for times that count back from it.
+    now_ns: the site's now, for relative times.
     """
     texts = {}
     for name, value in vars(arguments).items():
@@ -72,10 +72,10 @@ def _text(one: Parameter, value: Any, now_ns: Callable[[], int]) -> str:
 
 
 def numbers(values: list[float]) -> str:
-    """Numbers as a parameter has them."""
+    """Numbers in a parameter's form."""
     return ",".join(map(text_of, values))
 
 
 def spread(places: Mapping[str, list[float] | float | None]) -> dict[str, Any]:
-    """Places that a command takes by words of its own, as what argparse keeps of parameters."""
+    """Places from a command's own words, as argparse would keep parameters."""
     return {dest(name): value for name, value in places.items() if value is not None}

@@ -1,7 +1,7 @@
-"""Types of options: numbers, addresses, times as people write them, names of files to write.
+"""Types of options: numbers, addresses, times, output files.
 
-A wrong value is refused in one line, and a file that cannot be made before the work, not after it: that is tried, with
-one that has no name, since permissions do not tell (root, read-only mounts).
+Wrong values are refused in one line, unwritable files before the work. That is tried with an unnamed file, because
+permissions do not tell (root, read-only mounts).
 """
 
 from __future__ import annotations
@@ -22,44 +22,44 @@ T = TypeVar("T")
 
 
 def count(text: str) -> int:
-    """A whole number of 1 or more."""
+    """Integer >= 1."""
     _require(int(text) >= 1, f"{text} is not positive")
     return int(text)
 
 
 def days(text: str) -> int:
-    """A whole number of days that a certificate may be valid."""
+    """Days of a certificate's validity."""
     _require(count(text) <= 3650, f"{text} is more than 3650, the ten years of the authority")
     return int(text)
 
 
 def seed(text: str) -> int:
-    """A whole number of 0 or more."""
+    """Integer >= 0."""
     _require(int(text) >= 0, f"{text} is negative")
     return int(text)
 
 
 def positive(text: str) -> float:
-    """A finite number above 0."""
+    """Finite number > 0."""
     _require(0 < float(text) < float("inf"), f"{text} is not positive")
     return float(text)
 
 
 def not_negative(text: str) -> float:
-    """A finite number of 0 or more."""
+    """Finite number >= 0."""
     _require(0 <= float(text) < float("inf"), f"{text} is negative")
     return float(text)
 
 
 def shares(text: str) -> tuple[float, ...]:
-    """Shares of 0 to 1, comma-separated; the least first."""
+    """Comma-separated shares of 0 to 1, sorted."""
     values = tuple(sorted(set(map(float, text.split(",")))))
     _require(all(0 <= value <= 1 for value in values), f"{text} is not from 0 to 1")
     return values
 
 
 def address(text: str) -> tuple[str, int]:
-    """`9464`, of this host alone, or `0.0.0.0:9464`; port 0 takes a free one."""
+    """`9464`, for this host alone, or `0.0.0.0:9464`; port 0: any free one."""
     host, _, port = text.rpartition(":")
     is_port = port.isascii() and port.isdecimal() and int(port) < 2**16
     _require(is_port, f"{text!r} is neither PORT nor HOST:PORT")
@@ -67,7 +67,7 @@ def address(text: str) -> tuple[str, int]:
 
 
 def withhold(text: str) -> tuple[str, float, float]:
-    """Seconds off and period, `10/30`; or start and length, `120,60`; `none` withholds nothing."""
+    """Outage and period, `10/30` [s]; start and length, `120,60`; or `none`."""
     if text == "none":
         return text, 0.0, 0.0
     sign = "/" if "/" in text else ","
@@ -83,19 +83,19 @@ def withhold(text: str) -> tuple[str, float, float]:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Names, comma-separated."""
+    """Comma-separated names."""
     listed = tuple(name.strip() for name in text.split(","))
     _require(all(listed), f"{text!r} is no list of names, as gps-1,imu")
     return listed
 
 
 def count_or_names(text: str) -> int | tuple[str, ...]:
-    """A whole number of 1 or more, or names, comma-separated."""
+    """Integer >= 1, or comma-separated names."""
     return count(text) if text.lstrip("+-").isdecimal() else names(text)
 
 
 def setting(text: str) -> tuple[str, Any]:
-    """An option and its value as a file has it: `slip=0.1`, `start=[1, 2, 0.5]`; a word needs no quotes."""
+    """An option with a TOML value: `slip=0.1`, `start=[1, 2, 0.5]`; a word needs no quotes."""
     name, equals, value = text.partition("=")
     _require(bool(name and equals and value), f"{text!r} is not NAME=VALUE, as slip=0.1")
     try:
@@ -105,7 +105,7 @@ def setting(text: str) -> tuple[str, Any]:
 
 
 def taken(text: str) -> tuple[str, tuple[str, ...]]:
-    """A topic of a recording, and the kinds of sensors that it feeds: `/imu=imu,attitude`."""
+    """A topic of a recording, and the sensor kinds it feeds: `/imu=imu,attitude`."""
     topic, _, kinds = text.rpartition("=")
     _require(bool(topic and all(kinds.split(","))), f"{text!r} is not TOPIC=KIND, as /imu=imu,attitude")
     return topic, tuple(kinds.split(","))
@@ -117,12 +117,12 @@ def _require(is_so: bool, problem: str) -> None:  # noqa: FBT001 - a condition
 
 
 def site_time(text: str) -> SiteTime:
-    """A time, or one that counts back from the site's now; as a type of an argparse option."""
+    """A time, possibly relative to the site's now; for argparse."""
     return _said(parse_time, text)
 
 
 def stamp(text: str) -> int:
-    """A time as a stamp; likewise."""
+    """A time as a stamp; for argparse."""
     return _said(parse_stamp, text)
 
 
@@ -135,13 +135,13 @@ def _said(read: Callable[[str], T], text: str) -> T:
 
 @dataclass(frozen=True)
 class OutputFile:
-    """A file to write. suffixes: of its formats, none for any name. makes_folder: its folder need not be there."""
+    """Output file. suffixes: of its formats, empty: any. makes_folder: creates its folder."""
 
     suffixes: tuple[str, ...] = ()
     makes_folder: bool = False
 
     def __call__(self, text: str) -> Path:
-        """Parse the option; ConfigError where nothing could be written."""
+        """Parse the option; ConfigError if unwritable."""
         path = Path(text)
         if self.suffixes and path.suffix.lower() not in self.suffixes:
             fitting = path.with_suffix(self.suffixes[0]) if path.name else Path(f"NAME{self.suffixes[0]}")
@@ -156,10 +156,10 @@ class OutputFile:
 
 @dataclass(frozen=True)
 class OutputFolder:
-    """A folder to write into, made where it is missing."""
+    """Output folder, created if missing."""
 
     def __call__(self, text: str) -> Path:
-        """Parse the option; ConfigError where nothing could be written."""
+        """Parse the option; ConfigError if unwritable."""
         path = Path(text)
         _require_writable(path, path)
         return path
@@ -170,7 +170,7 @@ FOLDER = OutputFolder()
 
 
 def _require_writable(folder: Path, path: Path) -> None:
-    """Refuse a path where the folder, or the next one above it that is there, takes no file."""
+    """Refuse a path if its nearest existing folder takes no file."""
     there = folder.absolute()
     while not there.exists() and there != there.parent:
         there = there.parent

@@ -1,4 +1,4 @@
-"""Pictures of the map as it is, with the tracks of the machines."""
+"""Pictures of the current map with machine tracks."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ from sitegrid.options.parameters import dest, given, spread
 from sitegrid.process.lifetime import note, say
 from sitegrid.trust_sentences import calibrations
 
-AROUND_M = 30.0  # of the map around a drive
-STEP_M, MOST_STEPS = 5.0, 1000  # of a drive's profile
-MAX_POSES = 50_000  # of one machine: nearly three hours at 5 Hz
+AROUND_M = 30.0  # map shown around a drive
+STEP_M, MOST_STEPS = 5.0, 1000  # drive profile
+MAX_POSES = 50_000  # per machine: nearly three hours at 5 Hz
 LAYERS = ("resistance", "grade_east", "grade_north")
-SAMPLES_FOLLOW = "the map follows a minute or two later"  # the smoother's lag, which only agents know
+SAMPLES_FOLLOW = "the map follows a minute or two later"  # the smoother's lag is known to agents only
 
 
 def run(arguments: Namespace) -> int:
-    """Draw what is asked for."""
+    """Draw the requested picture."""
     files = {"picture": str(arguments.out)}
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         if query := _query(client, arguments):
@@ -67,7 +67,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _query(client: Client, arguments: Namespace) -> LineQuery | None:
-    """What is asked of a drive, if one is to be drawn."""
+    """The drive to draw, if any."""
     cls: type[LineQuery] = RouteQuery if arguments.line else WayQuery
     if places := arguments.line or arguments.between:
         ends = {"from": arguments.between and places[:2], "to": arguments.between and places[2:]}
@@ -83,7 +83,7 @@ def _query(client: Client, arguments: Namespace) -> LineQuery | None:
 
 
 def _step_m(places: Sequence[float]) -> float:
-    """Of a profile along these places: finer than its pixels on a usual site, and no more than it has of them."""
+    """Profile step: finer than a pixel on usual sites, bounded in number."""
     even = places[: len(places) // 2 * 2]
     corners = zip(even[::2], even[1::2], strict=True)
     length_m = sum(math.dist(a, b) for a, b in pairwise(corners))
@@ -91,7 +91,7 @@ def _step_m(places: Sequence[float]) -> float:
 
 
 def draw_line(client: Client, out: Path, query: LineQuery, bounds: list[float] | None) -> None:
-    """Ask for a drive and the map around it, and write their picture."""
+    """Draw a drive and the map around it."""
     answer = client.ask(query)
     low, high = answer.line_m.min(axis=0) - AROUND_M, answer.line_m.max(axis=0) + AROUND_M
     chosen = _bounds(client, bounds) if bounds else Bounds(*low.tolist(), *high.tolist())
@@ -101,7 +101,7 @@ def draw_line(client: Client, out: Path, query: LineQuery, bounds: list[float] |
 
 
 def draw_roads(client: Client, out: Path, bounds: list[float] | None) -> None:
-    """Ask for roads and worklist, and write their picture."""
+    """Draw roads and worklist."""
     chosen = _bounds(client, bounds) if bounds else None
     write_image(out, draw_worklist(client.ask(SegmentsQuery(bounds=chosen)), client.ask(WorklistQuery(bounds=chosen))))
 
@@ -114,9 +114,9 @@ def draw(
     truth: Path | None = None,
     empty: str = SAMPLES_FOLLOW,
 ) -> Region:
-    """Ask for the map and write its picture; with a true map the difference beside it.
+    """Draw the map, and beside it the difference from a true map if given.
 
-    empty: what the title says of a map without any ground, on which machines drive.
+    empty: note in the title while driven ground has no values yet.
     """
     region = client.region(_bounds(client, bounds), LAYERS)
     image = side_by_side(draw_both(region, tracks, empty, client.machines()))
@@ -128,14 +128,14 @@ def draw(
 
 
 def beside(out: Path) -> Path:
-    """The file of the difference from a true map."""
+    """File of the difference from a true map."""
     return out.with_stem(f"{out.stem}-difference")
 
 
 def draw_both(
     region: Region, tracks: list[DrawnTrack], empty: str = SAMPLES_FOLLOW, machines: Sequence[MachineState] = ()
 ) -> list[Image]:
-    """Resistance and grade; the title of a map without any resistance says why. machines: calibrated ones are noted."""
+    """Resistance and grade; an empty map's title says why. machines: calibrated ones are noted."""
     resistance = draw_resistance(region, tracks, _title(region, tracks, empty), calibrations(machines))
     return [resistance, draw_grade(region, tracks)]
 
@@ -149,13 +149,13 @@ def _title(region: Region, tracks: list[DrawnTrack], empty: str) -> str:
 
 
 def draw_differences(region: Region, truth: Path) -> list[Image]:
-    """How far resistance and grade are from a true map."""
+    """Difference of resistance and grade from a true map."""
     layers = truth_layers(TruthMap.load(truth), region)
     return [draw_difference(region, layers, name) for name in ("resistance", "grade")]
 
 
 def _bounds(client: Client, given: list[float] | None) -> Bounds:
-    """The rectangle to draw: as given, or everything that is known."""
+    """The given rectangle, or the known map's."""
     if given:
         try:
             return Bounds(*given)
@@ -170,7 +170,7 @@ def _bounds(client: Client, given: list[float] | None) -> Bounds:
 
 
 def truth_layers(truth: TruthMap, region: Region) -> dict[str, Floats32]:
-    """True layers on the cells of a region, NaN beyond the simulated site."""
+    """True layers on a region's cells, NaN beyond the simulated site."""
     if abs(truth.cell_m - region.cell_m) > 1e-9:
         raise ConfigError("--truth", f"has cells of {truth.cell_m:g} m, the map of {region.cell_m:g} m")
     column = round((region.bounds.west_m - truth.west_m) / truth.cell_m)
@@ -189,7 +189,7 @@ def _cut(values: Floats32, row: int, column: int, shape: tuple[int, ...]) -> Flo
 
 
 class TrackRecorder:
-    """Subscribes to the poses of a site."""
+    """Subscribes to a site's poses."""
 
     def __init__(self, session: zenoh.Session, site: str) -> None:
         self._lock = threading.Lock()
@@ -197,12 +197,12 @@ class TrackRecorder:
         self._listener = Listener(session, keys.poses_all(site), receive_pose, self._on_pose)
 
     def poses(self) -> dict[str, list[Pose]]:
-        """All poses so far, by machine."""
+        """All poses so far by machine."""
         with self._lock:
             return {name: list(poses) for name, poses, _ in sorted(self._poses.items())}
 
     def tracks(self) -> list[DrawnTrack]:
-        """All poses so far, as lines to draw."""
+        """All poses so far as lines."""
         return [
             DrawnTrack(name, np.array([p.x_m for p in poses]), np.array([p.y_m for p in poses]))
             for name, poses in self.poses().items()

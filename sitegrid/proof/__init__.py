@@ -1,1 +1,1 @@
-"""Scores of what was simulated: samples delivered, maps and positions against the truth."""
+"""Scores of simulations: delivery of samples, errors of maps and positions."""

@@ -1,8 +1,7 @@
-"""Lost and double: what agents recorded, against the server's journal and against its grid.
+"""Lost and double samples: agents' records against the server's journal and grid.
 
-Identity is (machine, spool_id, seq), content is the hash of the sample's bytes. The journal is folded again from
-nothing and compared, count by count, with the grid that a server would start with: that of the last snapshot, and the
-rows since, where this one had to end before it could write another.
+Identity is (machine, spool_id, seq), content the hash of the sample's bytes. The journal is folded from scratch and
+compared, count by count, with the grid that a server would start with: the last snapshot plus later rows.
 """
 
 from __future__ import annotations
@@ -36,12 +35,11 @@ SampleKey = tuple[str, int, int]  # machine, spool_id, seq
 
 @dataclass(frozen=True)
 class AuditResult:
-    """What became of the recorded samples.
+    """Outcome of the recorded samples.
 
-    recorded: in the audit files; merged: voted in the grid, or journalled but too uncertain of their position to vote,
-    or of a machine that is not trusted. lost: recorded, but not in the journal with the same content, or missing in the
-    grid; double: more than once in the journal, by identity or by content, or too often in the grid. unrecorded: in the
-    journal, but in no audit file.
+    recorded: in the audit files. merged: voted in the grid, or journalled but without a vote (uncertain position,
+    untrusted machine). lost: recorded, but missing in the journal with this content, or in the grid. double: repeated
+    in the journal by identity or content, or in the grid. unrecorded: in the journal only.
     """
 
     recorded: int
@@ -52,7 +50,7 @@ class AuditResult:
 
 
 def read_audits(audits: Mapping[str, Path]) -> dict[SampleKey, Contents]:
-    """Content hashes of every recorded sample; audits: machine -> file."""
+    """Content hashes of all recorded samples; audits: machine -> file."""
     return {
         (machine, spool, seq): contents
         for machine, path in audits.items()
@@ -61,7 +59,7 @@ def read_audits(audits: Mapping[str, Path]) -> dict[SampleKey, Contents]:
 
 
 def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, config: ServerConfig) -> AuditResult:
-    """Compare audit files with the store of a server that has ended."""
+    """Compare audit files with a stopped server's store."""
     location = JournalLocation(folder)
     with location.reader() as journal:
         rows = list(history_rows(History(journal, location.archive)))
@@ -81,7 +79,7 @@ def compare(
     config: ServerConfig,
     facts: Facts = NO_FACTS,
 ) -> AuditResult:
-    """Compare recorded samples with journal rows, and those, folded again, with a grid; facts: of the grid."""
+    """Compare recorded samples with journal rows, and the folded rows with a grid; facts: of the grid."""
     withheld = 0
     refolded = Grid(site.cell_m, config.fold, REFOLD_ROWS)
     hashes: dict[SampleKey, list[str]] = {}
@@ -113,10 +111,9 @@ def _fold(grid: Grid, row: JournalRow, facts: Facts) -> None:
 
 
 def grid_difference(expected: GridState, actual: GridState) -> tuple[int, int]:
-    """About how many samples are missing in a grid, and how many are too many: 0, 0 only where all counts agree.
+    """Approximate missing and surplus samples in a grid; 0, 0 only if all counts agree.
 
-    Counts are compared cell by cell; their difference is turned into samples by the counts of a mean sample, rounded
-    up.
+    Counts are compared by cell; differences become samples by a mean sample's counts, rounded up.
     """
     per_sample = max(1.0, sum(map(_votes, expected.pages)) / max(1, expected.folded))
     there = {(at.x, at.y, at.tier, at.index): at.page for at in actual.pages}

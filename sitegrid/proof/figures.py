@@ -1,7 +1,4 @@
-"""Figures of reports: rows of plain values, what many of them need, and their rounding.
-
-A report is a table of rows beside what was run; JSON prints both as they are.
-"""
+"""Report rows: plain values, shared statistics, rounding. JSON prints reports as they are."""
 
 from __future__ import annotations
 
@@ -20,12 +17,12 @@ Report = dict[str, Any]  # the same, and lists of rows
 
 
 def root_mean_square(values: Floats) -> float:
-    """Root mean square, NaN of nothing."""
+    """Root mean square; NaN if empty."""
     return float(np.sqrt((values**2).mean())) if len(values) else math.nan
 
 
 def half_width(sample: Floats) -> float | None:
-    """Half-width of the 95 % interval of a mean, by Student's t; None of a single value."""
+    """Half-width of a mean's 95 % interval (Student's t); None for one value."""
     n = len(sample)
     if n < 2:
         return None
@@ -34,7 +31,7 @@ def half_width(sample: Floats) -> float | None:
 
 
 def rounded(value: Value, digits: int, **other_digits: int) -> Value:
-    """Round every float in a value, in lists and rows too; other_digits: of a row's figures by name."""
+    """Round all floats, in lists and rows too; other_digits: by name."""
     out: Any = value
     if isinstance(value, float):
         out = round(value, digits)

@@ -1,7 +1,4 @@
-"""How right a map is: the paper's J, the share of known cells whose class differs from the truth.
-
-Wrong cells are counted by their distance from the nearest border between two kinds of ground, too.
-"""
+"""Map error: the paper's J, the share of known cells in the wrong class; also by distance from the nearest border."""
 
 from __future__ import annotations
 
@@ -17,13 +14,13 @@ from protocol.queries.answers import Region
 from protocol.site.ground_classes import UNKNOWN, resistance_class, slope_class, wrong_percent
 from sitegrid.proof.figures import Row
 
-EDGES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # of the bins of distances; the last bin is open
-TRACK_STEP_M = 0.1  # between two points of a track that is compared with cells
+EDGES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # edges of distance bins; the last bin is open
+TRACK_STEP_M = 0.1  # point spacing of tracks on the grid
 
 
 @dataclass(frozen=True)
 class MapScore:
-    """Known cells, and the percentage of them that are wrong (NaN where none is known)."""
+    """Known cells, and the percentage in the wrong class (NaN if none is known)."""
 
     cells: int
     wrong_resistance_pct: float
@@ -32,7 +29,7 @@ class MapScore:
 
 @dataclass(frozen=True)
 class DrivenScore:
-    """Cells that a load centre truly passed, which of them the map knows [%], and which of those are wrong [%].
+    """Cells truly passed by a load centre, the share known [%], and the share of these in the wrong class [%].
 
     by_border: see `by_border_distance`.
     """
@@ -45,17 +42,17 @@ class DrivenScore:
 
 
 def score(region: Region, truth: NamedLayers) -> MapScore:
-    """Compare a map with true layers of the same cells (resistance, grade_east, grade_north)."""
+    """Compare a map with true layers on its cells (resistance, grade_east, grade_north)."""
     (resistance, slope), (true, true_slope) = _classes(region), _classes(truth)
     cells = int((resistance != UNKNOWN).sum())
     return MapScore(cells, wrong_percent(resistance, true), wrong_percent(slope, true_slope))
 
 
 def score_driven(region: Region, truth: NamedLayers, tracks_m: Iterable[Floats]) -> DrivenScore:
-    """Compare a map with true layers of the same cells where machines truly were.
+    """Compare a map with true layers where machines truly were.
 
-    Cells that are known but were never passed, because a position was wrong, do not count. tracks_m: true places
-    (n, 2) of each machine's load centre, as `sitegrid.proof.tracks.read_load_track` has them.
+    Known cells that were never passed, from wrong positions, do not count. tracks_m: true places (n, 2) of each load
+    centre, from `sitegrid.proof.tracks.read_load_track`.
     """
     (resistance, slope), (true, true_slope) = _classes(region), _classes(truth)
     driven = driven_cells(region, tracks_m) & (true != UNKNOWN)
@@ -70,7 +67,7 @@ def score_driven(region: Region, truth: NamedLayers, tracks_m: Iterable[Floats])
 
 
 def driven_cells(region: Region, tracks_m: Iterable[Floats]) -> Bools:
-    """Which cells (rows, columns) of a region any of the tracks (n, 2) passes."""
+    """Cells (rows, columns) of a region on any track (n, 2)."""
     passed: Bools = np.zeros((len(region.y_m), len(region.x_m)), np.bool_)
     corner = np.array([region.bounds.west_m, region.bounds.south_m])
     for track_m in tracks_m:
@@ -81,9 +78,9 @@ def driven_cells(region: Region, tracks_m: Iterable[Floats]) -> Bools:
 
 
 def by_border_distance(estimated: Ints, true: Ints, border_m: Floats) -> list[Row]:
-    """Count known and wrong cells (k,) by their distance from the nearest border, in bins from_m to to_m (None: open).
+    """Known and wrong cells (k,) by distance from the nearest border, from_m to to_m (None: open).
 
-    cells: with a truth. known_pct: share of them that is known. wrong_pct: share of the known ones that is wrong.
+    cells: with a truth. known_pct: of these. wrong_pct: of the known ones.
     """
     estimated, true, border_m = (values[true != UNKNOWN] for values in (estimated, true, border_m))
     which = np.digitize(border_m, EDGES_M) - 1
@@ -97,21 +94,20 @@ def by_border_distance(estimated: Ints, true: Ints, border_m: Floats) -> list[Ro
 
 
 def border_distance(classes: Ints, cell_m: float) -> Floats:
-    """Distance [m] of the cells' centres (rows, columns) from the nearest cell of another class.
+    """Distance [m] of cell centres (rows, columns) from the nearest cell of another class.
 
-    Cells of class UNKNOWN border on nothing; infinite where there is no other class.
+    UNKNOWN borders on nothing; infinite without another class.
     """
     distance = np.full(classes.shape, np.inf)
     for kind in np.unique(classes[classes != UNKNOWN]).tolist():
         others = (classes != kind) & (classes != UNKNOWN)
         if others.any():
             here = classes == kind
-            distance[here] = (distance_transform_edt(~others)[here] - 0.5) * cell_m  # to its edge, not to its centre
+            distance[here] = (distance_transform_edt(~others)[here] - 0.5) * cell_m  # to its edge
     return distance
 
 
 def _classes(layers: Region | NamedLayers) -> tuple[Ints, Ints]:
-    """Classes of resistance and of slope."""
     return resistance_class(layers["resistance"]), slope_class(layers["grade_east"], layers["grade_north"])
 
 

@@ -1,4 +1,4 @@
-"""The true track of a machine, as a simulation or a log's `evaluation.toml` has it."""
+"""True tracks of machines, from a simulation or a log's `evaluation.toml`."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Truth:
     position_m: Floats
 
     def at(self, stamp_ns: Ints) -> Floats:
-        """True positions (m, 2); NaN before the first and after the last that is known."""
+        """True positions (m, 2); NaN outside the track's time."""
         return interpolate(stamp_ns, self.stamp_ns, self.position_m)
 
 
 def interpolate(stamp_ns: Ints, known_ns: Ints, values: Floats) -> Floats:
-    """Values (n,) or (n, k) of known instants (n,) at other ones (m,); NaN before the first and after the last."""
+    """Interpolate values (n,) or (n, k) at (n,) to other instants (m,); NaN outside."""
     t, known = (np.asarray(stamps - known_ns[0], float) * 1e-9 for stamps in (stamp_ns, known_ns))
     if values.ndim == 1:
         return np.interp(t, known, values, math.nan, math.nan)
@@ -35,17 +35,17 @@ def interpolate(stamp_ns: Ints, known_ns: Ints, values: Floats) -> Floats:
 
 
 def read_track(path: Path) -> Truth:
-    """The truth that a simulation wrote: `tracks/<machine>.csv`."""
+    """Read a simulation's `tracks/<machine>.csv`."""
     table = np.genfromtxt(path, delimiter=",", names=True, dtype=None)
     return Truth(table["stamp_ns"].astype(np.int64), np.stack([table["x"], table["y"]], axis=1))
 
 
 @dataclass(frozen=True)
 class LoadTrack:
-    """True track of a machine's load centre, n instants.
+    """True track of a load centre, n instants.
 
-    stamp_ns: (n,). place_m: (n, 2) in `map`. yaw_rad: of the machine (n,), without jumps. gradient: of the plane
-    through its wheels, east and north (n, 2) [m/m]. driven_m: how far the load centre has moved so far (n,).
+    stamp_ns: (n,). place_m: (n, 2) in `map`. yaw_rad: of the machine (n,), unwrapped. gradient: of the plane through
+    its wheels, east and north (n, 2) [m/m]. driven_m: distance of the load centre so far (n,).
     """
 
     stamp_ns: Ints
@@ -55,13 +55,13 @@ class LoadTrack:
     driven_m: Floats
 
     def at(self, stamp_ns: Ints) -> LoadTrack:
-        """The same at other instants (m,); NaN before the first and after the last that is known."""
+        """Interpolate to other instants (m,); NaN outside the track's time."""
         columns = (self.place_m, self.yaw_rad, self.gradient, self.driven_m)
         return LoadTrack(stamp_ns, *(interpolate(stamp_ns, self.stamp_ns, values) for values in columns))
 
 
 def read_load_track(path: Path, load_centre_m: float) -> LoadTrack:
-    """The truth that a simulation wrote: `tracks/<machine>.csv`."""
+    """Read a simulation's `tracks/<machine>.csv`."""
     table = np.genfromtxt(path, delimiter=",", names=True, dtype=None)
     base, yaw = np.stack([table["x"], table["y"]], axis=-1), np.unwrap(table["yaw"])
     place = base + load_centre_m * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
@@ -71,7 +71,7 @@ def read_load_track(path: Path, load_centre_m: float) -> LoadTrack:
 
 
 def position_rmse(poses: Mapping[str, Sequence[Pose]], truth: Path) -> dict[str, float]:
-    """Root mean square position error [m] of each machine; truth: the folder that a simulation wrote."""
+    """Position RMSE [m] by machine; truth: a simulation's folder."""
     rmse = {}
     for name, track in poses.items():
         true = np.genfromtxt(truth / "tracks" / f"{name}.csv", delimiter=",", names=True)

@@ -1,1 +1,1 @@
-"""Recordings of a running site, and their replay."""
+"""Recording and replay of a running site."""

@@ -1,4 +1,4 @@
-"""What a site says, as messages of a recording with Foxglove's schemas. Places are in the frame `map`."""
+"""A site's messages with Foxglove's schemas for recordings; places in the frame `map`."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from sitegrid.health import problems_of, status_of
 from sitegrid.process.lifetime import plain
 
 TRANSFORM, LOG, GRID = "foxglove.FrameTransform", "foxglove.Log", "foxglove.Grid"
-COVARIANCE_KNOWN = 3  # Foxglove's numbers: of a covariance,
-INFO, WARNING = 2, 3  # of levels of a log,
-FLOAT32 = 7  # and of types in a grid
-LAYERS = [name for name in PLANES if name != "since"]  # which is an age, counted from the newest sample of the tile
+COVARIANCE_KNOWN = 3  # Foxglove's codes: of covariances,
+INFO, WARNING = 2, 3  # of log levels,
+FLOAT32 = 7  # of grid types
+LAYERS = [name for name in PLANES if name != "since"]  # an age, relative to the tile's newest sample
 INTEGER = {"type": "integer"}
 
 
@@ -55,7 +55,7 @@ PROPERTIES: dict[str, dict[str, Any]] = {
 
 
 class SiteMessage(NamedTuple):
-    """One message of a site, before it is recorded. stamp_ns: when it was true."""
+    """One message before recording. stamp_ns: when it was true."""
 
     topic: str
     schema: str
@@ -63,8 +63,8 @@ class SiteMessage(NamedTuple):
     values: Mapping[str, Any]
 
     def record(self, recording: Recording, log_ns: int) -> None:
-        """Add it to a recording; ValueError where JSON does not know a value in it."""
-        stamp_ns = self.stamp_ns or log_ns  # an agent has none before its first reading
+        """Add it to a recording; ValueError if JSON cannot represent a value."""
+        stamp_ns = self.stamp_ns or log_ns  # agents have no stamp before the first reading
         table = {"timestamp": time_of(stamp_ns), **self.values}
         data = json.dumps(plain(table), allow_nan=False).encode()
         properties = {"timestamp": TIME, **PROPERTIES[self.schema]}
@@ -72,7 +72,7 @@ class SiteMessage(NamedTuple):
 
 
 def transform_of(pose: Pose) -> SiteMessage:
-    """A pose as a transform from the machine's frame, and its speed."""
+    """A pose as a transform from the machine's frame, with speed."""
     half = pose.heading_rad / 2
     values = {
         "parent_frame_id": "map",
@@ -85,7 +85,7 @@ def transform_of(pose: Pose) -> SiteMessage:
 
 
 def place_of(pose: Pose, projection: Projection) -> SiteMessage:
-    """A pose as a place on Earth, with its covariance."""
+    """A pose as a place on Earth, with covariance."""
     xx, xy, yy = pose.cov_xx_m2, pose.cov_xy_m2, pose.cov_yy_m2
     covariance = (xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, 0.0)
     fix = fix_of(pose.machine, projection.to_geodetic(pose.x_m, pose.y_m), covariance, COVARIANCE_KNOWN)
@@ -93,14 +93,14 @@ def place_of(pose: Pose, projection: Projection) -> SiteMessage:
 
 
 def health_of(health: Health) -> SiteMessage:
-    """What an agent says of itself, as a line of a log, and all of it as `values`."""
+    """An agent's status as a log line, its health as `values`."""
     level = WARNING if problems_of(health.values) else INFO
     line = _line(level, status_of(health.values), health.machine)
     return SiteMessage(f"/machine/{health.machine}/health", LOG, health.stamp_ns, line | {"values": health.values})
 
 
 def change_of(change: GroundChange) -> SiteMessage:
-    """A change of the ground, as a line of a log, and its fields as `change`."""
+    """A ground change as a log line, its fields as `change`."""
     before, after = (
         "unknown" if value is None else f"{value:.3g}" for value in (change.resistance_before, change.resistance_after)
     )
@@ -109,12 +109,12 @@ def change_of(change: GroundChange) -> SiteMessage:
 
 
 def gap_of(stamp_ns: int, problem: str) -> SiteMessage:
-    """What the recording lacks, as a line of a log."""
+    """A gap of the recording as a log line."""
     return SiteMessage("/recording/gaps", LOG, stamp_ns, _line(WARNING, problem, "recording"))
 
 
 def tile_of(tile: MapTile, cell_m: float) -> SiteMessage:
-    """A tile as a grid of LAYERS, float32 with NaN for unknown; each on a topic of its own, so that all are shown."""
+    """A tile as a grid of LAYERS, float32, NaN unknown; a topic per tile, so that all are shown."""
     planes = tile.unpacked()
     cells = np.stack([PLANES[name].values()[planes[name]] for name in LAYERS], axis=-1).astype("<f4")
     width = cells.itemsize
@@ -133,7 +133,7 @@ def tile_of(tile: MapTile, cell_m: float) -> SiteMessage:
 
 
 def kind_of(topic: str) -> str:
-    """What the messages of a topic are, for counts."""
+    """Kind of a topic's messages."""
     _, first, *rest = topic.split("/")
     return rest[1] if first == "machine" else rest[0]
 

@@ -1,7 +1,7 @@
-"""Recording of a running site: what machines and map server say, as it comes, into one file.
+"""Record a running site's messages, machines and map server, into one file.
 
-Zenoh's callbacks only put bytes into a queue, which is bounded: the site never waits for the recording, except for one
-question about tiles at a time. What finds no room is dropped and counted.
+Zenoh's callbacks only fill a bounded queue, so the site never waits, except for one tile query at a time. Overflow is
+dropped and counted.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from sitegrid.record.messages import (
 if TYPE_CHECKING:
     from sitegrid.record.samples import NewSamples
 
-LOOK_S = 5.0  # between two questions about tiles, each of which the map server answers with what differs
+LOOK_S = 5.0  # between tile queries, answered with changes
 SECOND_S = 1.0
-MOST_BYTES = 64 * 2**20  # that wait to be written: minutes of a large site
+MOST_BYTES = 64 * 2**20  # queue capacity: minutes of a large site
 TILE_BYTES = 8 * AREA * len(LAYERS)  # of a tile as a message
 WHAT = ("poses", "health", "readings", "tiles", "changes")
 log = logging.getLogger("sitegrid.record")
@@ -53,14 +53,14 @@ Work = Callable[[], None]
 
 
 class Waiting:
-    """Work that waits, with a bound on its bytes."""
+    """Queue of work, bounded in bytes."""
 
     def __init__(self, most_bytes: int = MOST_BYTES) -> None:
         self._queue: queue.SimpleQueue[tuple[Work, int]] = queue.SimpleQueue()
         self._left_bytes, self._room = most_bytes, threading.Condition()
 
     def put(self, work: Work, size: int, wait_s: float = 0.0) -> bool:
-        """Have work done later; whether there is room for it, in time."""
+        """Enqueue work; False if there is no room in time."""
         with self._room:
             if not self._room.wait_for(lambda: self._left_bytes >= size, wait_s):
                 return False
@@ -69,7 +69,7 @@ class Waiting:
         return True
 
     def do_next(self, wait_s: float) -> None:
-        """Do the work that waits longest; nothing where none comes."""
+        """Do the oldest work, if any arrives in time."""
         try:
             work, size = self._queue.get(timeout=wait_s)
         except queue.Empty:
@@ -81,7 +81,7 @@ class Waiting:
 
 
 class SiteRecorder:
-    """Records one site until it is stopped. tell: gets a line about each gap. lost: messages dropped or refused."""
+    """Records one site until stopped. tell: called with a line per gap. lost: dropped or refused messages."""
 
     def __init__(
         self,
@@ -94,12 +94,12 @@ class SiteRecorder:
         self._client, self._recording, self._what, self._samples = client, recording, what, samples
         self._projection = projection_of(client.site_info())
         self._tell, self._waiting, self._stop = tell, Waiting(), threading.Event()
-        self._gaps: dict[str, float] = {}  # what is not there, and since when
+        self._gaps: dict[str, float] = {}  # what is missing, since when
         self._listened: dict[str, Any] = {}
         self.lost: Counter[str] = Counter()
 
     def run(self, is_stopped: Callable[[], bool]) -> None:
-        """Record until `is_stopped`; OSError where there is no room."""
+        """Record until `is_stopped`; OSError if the disk is full."""
         with ExitStack() as opened:
             session, site = self._client.session, self._client.site
             if "poses" in self._what:
@@ -122,10 +122,10 @@ class SiteRecorder:
                 if time.monotonic() >= due_s:
                     due_s = time.monotonic() + SECOND_S
                     self._tend()
-            self._tend()  # samples that came since
+            self._tend()  # late samples
 
     def counts(self) -> dict[str, int]:
-        """Messages by what they are."""
+        """Messages by kind."""
         counts: Counter[str] = Counter()
         for topic, count in self._recording.counts.items():
             counts[kind_of(topic)] += count
@@ -152,13 +152,13 @@ class SiteRecorder:
     def _on_sample(self, take: Callable[[str, bytes, int], None], sample: zenoh.Sample) -> None:
         data = sample.payload.to_bytes()
         work = partial(self._take, take, str(sample.key_expr), data, time.time_ns())
-        if not self._waiting.put(work, len(data) + 1000):  # and what Python needs for it
+        if not self._waiting.put(work, len(data) + 1000):  # plus Python's overhead
             self.lost["dropped"] += 1
 
     def _take(self, take: Callable[[str, bytes, int], None], key: str, data: bytes, log_ns: int) -> None:
         try:
             take(key, data, log_ns)
-        except (MessageError, ValueError):  # ValueError: numbers that JSON does not know
+        except (MessageError, ValueError):  # ValueError: numbers unknown to JSON
             self.lost["refused"] += 1
 
     def _on_pose(self, key: str, data: bytes, log_ns: int) -> None:
@@ -172,7 +172,7 @@ class SiteRecorder:
             health_of(health).record(self._recording, log_ns)
 
     def _on_token(self, key: str, *_: object) -> None:
-        """Listen to the readings of a machine, once its agent is there: the simulator waits for that, not for us."""
+        """Subscribe to a machine's readings after its agent, because the simulator waits for the agent."""
         name = keys.machine_of(key)
         if name not in self._listened and len(self._listened) < MOST_NAMES:
             self._listened[name] = self._subscribe(keys.sensors(self._client.site, name), self._on_bundle)
@@ -184,7 +184,7 @@ class SiteRecorder:
                 record_reading(self._recording, bundle.machine, log_ns, reading)
 
     def _look(self) -> None:
-        """Ask for what differs in the map, again and again; what a gap lacks comes after it."""
+        """Query map changes repeatedly; after a gap its changes follow."""
         version: MapVersion | None = None
         known: dict[int, GroundChange] = {}
         while not self._stop.is_set():
@@ -206,7 +206,7 @@ class SiteRecorder:
             self._stop.wait(LOOK_S)
 
     def _enqueue(self, message: Callable[[], SiteMessage], size: int) -> None:
-        """Have a message written, once there is room."""
+        """Enqueue a message as soon as there is room."""
         work = partial(self._record, message, time.time_ns())
         while not self._stop.is_set() and not self._waiting.put(work, size, SECOND_S):
             pass
@@ -215,7 +215,7 @@ class SiteRecorder:
         message().record(self._recording, log_ns)
 
     def _note_gap(self, what: str, problem: str) -> None:
-        """Tell, and record, that a gap begins or ends."""
+        """Report and record the start or end of a gap."""
         if bool(problem) == (what in self._gaps):
             return
         if problem:

@@ -1,4 +1,4 @@
-"""Replay of recordings: readings to agents, in bundles as they came, or samples to a map server."""
+"""Replay recordings: readings to agents in their original bundles, or samples to a map server."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from protocol.wire.codec import decode_batch, decode_health, decode_reply, encod
 from protocol.wire.messages import Ack, Refused
 from sitegrid.health import number_of
 
-MOST_READINGS = 1000  # of a bundle: 100 kB
-MOST_AHEAD = 2000  # bundles that an agent has not taken yet; half of what it keeps in its queue
-SILENT_S = 30.0  # without an agent, or with one that takes nothing
-REPLY_S = 3.0  # for one answer of the map server
+MOST_READINGS = 1000  # per bundle: 100 kB
+MOST_AHEAD = 2000  # bundles not yet taken by an agent; half of its queue
+SILENT_S = 30.0  # timeout: no agent, or none that takes readings
+REPLY_S = 3.0  # timeout of a map server's reply
 POLL_S = 0.05
 Sign = Callable[[str, bytes], bytes]
-Bundle = tuple[str, int, list[Reading]]  # machine, when it was recorded, readings
+Bundle = tuple[str, int, list[Reading]]  # machine, time of recording, readings
 
 
 class _Open:
-    """A bundle that is being filled: its readings come out of a bundle in the order in which they went in."""
+    """A bundle being filled; its readings leave an agent's sort in the order they entered."""
 
     def __init__(self, log_ns: int) -> None:
         self.log_ns, self.readings = log_ns, list[Reading]()
@@ -42,7 +42,7 @@ class _Open:
         self._last = (0, 0)
 
     def takes(self, reading: Reading, log_ns: int) -> bool:
-        """Add a reading, if it belongs in here: what is sent gets sorted by stamp, then by sensor, first come first."""
+        """Add a reading if it fits: agents sort by stamp, then sensor, stably."""
         place = reading.stamp_ns, self._sensors.get((reading.sensor, reading.kind), len(self._sensors))
         is_long = log_ns - self.log_ns >= SPAN_NS or len(self.readings) == MOST_READINGS
         if self.readings and (is_long or place < self._last):
@@ -54,7 +54,7 @@ class _Open:
 
 
 def bundles(recorded: Iterable[RecordedReading]) -> Iterator[Bundle]:
-    """Readings in bundles, each machine's in the order in which its agent took them."""
+    """Readings in bundles, in each agent's original order."""
     opened: dict[str, _Open] = {}
     for machine, log_ns, reading in recorded:
         if not opened.setdefault(machine, _Open(log_ns)).takes(reading, log_ns):
@@ -66,18 +66,18 @@ def bundles(recorded: Iterable[RecordedReading]) -> Iterator[Bundle]:
 
 
 class Agents:
-    """Agents of a site that are fed, no faster than their health says that they take readings. sent: by machine."""
+    """Feeds a site's agents no faster than their health shows progress. sent: by machine."""
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, stop: threading.Event) -> None:
         self._session, self._endpoint, self._site, self._stop = session, endpoint, site, stop
-        self._taken: dict[str, int] = {}  # readings that each agent had, of anybody, since its start
+        self._taken: dict[str, int] = {}  # readings taken by each agent since its start, from any source
         self._streams: dict[str, BundleStream] = {}
-        self._ahead: dict[str, deque[int]] = {}  # what each will have taken with each bundle that is on its way
+        self._ahead: dict[str, deque[int]] = {}  # per bundle under way: the agent's count once it is taken
         self._health: Any = session.declare_subscriber(keys.health_all(site), self._on_health)
         self.sent: Counter[str] = Counter()
 
     def feed(self, machine: str, readings: list[Reading]) -> None:
-        """Publish a bundle, once its agent is there and not far behind; LinkError where that does not come."""
+        """Publish a bundle once its agent is present and close behind; LinkError on timeout."""
         if machine not in self._streams:
             self._wait(lambda: machine in self._taken, f"no agent of {machine} runs on site {self._site}: start one")
             self._ahead[machine] = deque([self._taken.get(machine, 0)])
@@ -89,7 +89,7 @@ class Agents:
         ahead.append(ahead[-1] + len(readings))
 
     def close(self) -> None:
-        """End the streams, and with them the agents."""
+        """End the streams, and thereby the agents."""
         self._health.undeclare()
         for stream in self._streams.values():
             stream.close()
@@ -113,7 +113,7 @@ class Agents:
 
 
 def feed_agents(recorded: Iterable[RecordedReading], agents: Agents, speed: float, stop: threading.Event) -> None:
-    """Feed agents with readings, at so many times the speed at which they were recorded; 0: as they are taken."""
+    """Feed agents at a multiple of recorded speed; 0: as fast as they take."""
     begin_ns, pace = 0, StreamClock(speed, stop, time.monotonic)
     for machine, log_ns, readings in bundles(recorded):
         begin_ns = begin_ns or log_ns
@@ -124,15 +124,15 @@ def feed_agents(recorded: Iterable[RecordedReading], agents: Agents, speed: floa
 
 
 class SampleSender:
-    """Sends batches of samples to a map server, as their machines did. sent, had: samples it took, and had already."""
+    """Sends sample batches to a map server as the machines did. sent, had: new samples, and duplicates."""
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, sign: Sign | None) -> None:
-        """sign: makes the signature beside each batch, on a site with keys."""
+        """sign: signature of a batch, on a site with keys."""
         self._session, self._endpoint, self._site, self._sign = session, endpoint, site, sign
         self.sent = self.had = 0
 
     def send(self, machine: str, data: bytes, stop: threading.Event) -> None:
-        """Send one batch until it is acknowledged; QueryError where it is refused, LinkError where nobody answers."""
+        """Send a batch until acknowledged; QueryError if refused, LinkError without an answer."""
         batch = decode_batch(data, MAX_EXTENT_M)
         end_s = time.monotonic() + SILENT_S
         while not stop.is_set():
@@ -141,7 +141,7 @@ class SampleSender:
                     self.sent, self.had = self.sent + len(batch.rows) - trimmed, self.had + trimmed
                     return
                 case Refused(reason=Refusal.GAP, expected=expected) if 0 < expected < batch.first_seq:
-                    data = encode_batch(replace(batch, lost_before=batch.first_seq - expected))  # not in the recording
+                    data = encode_batch(replace(batch, lost_before=batch.first_seq - expected))  # not recorded
                 case Refused(retry_after_s=wait_s) if wait_s and time.monotonic() < end_s:
                     stop.wait(wait_s)
                 case Refused(reason, problem):
@@ -154,12 +154,12 @@ class SampleSender:
         for reply in self._session.get(key, payload=data, attachment=signature, timeout=REPLY_S):
             if reply.ok is not None:
                 return decode_reply(reply.ok.payload.to_bytes())
-        time.sleep(POLL_S)  # nobody answers at once where no server is
+        time.sleep(POLL_S)  # without a server the reply is instant
         return None
 
 
 def send_samples(messages: Iterable[Message], sender: SampleSender, speed: float, stop: threading.Event) -> None:
-    """Send the samples of a recording, as `feed_agents` feeds agents."""
+    """Send a recording's samples; speed as in `feed_agents`."""
     begin_ns, pace = 0, StreamClock(speed, stop, time.monotonic)
     for message in messages:
         words = message.topic.split("/")

@@ -1,4 +1,4 @@
-"""Samples that a store takes while it is recorded, as batches of the wire, with the identity that they have."""
+"""New samples of a store during a recording, as wire batches with their identity."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from protocol.wire.messages import SampleBatch
 
 
 class NewSamples:
-    """What comes into a store from now on."""
+    """Rows added to a store from now on."""
 
     def __init__(self, folder: Path) -> None:
-        """ConfigError where there is no store; StoreError where it cannot be read."""
+        """ConfigError without a store; StoreError if unreadable."""
         self._location = JournalLocation(folder)
         if not self._location.exists():
             raise ConfigError(folder, "is no store of a map server on this host")
@@ -26,7 +26,7 @@ class NewSamples:
     def read(self) -> Iterator[tuple[str, bytes]]:
         """Machines and batches since the last call; StoreError."""
         with self._location.reader() as reader:
-            self._row = min(self._row, reader.state().row)  # of a store that was restored
+            self._row = min(self._row, reader.state().row)  # after a restore
             for rows in read_history(History(reader, self._location.archive), self._row):
                 for row in rows:
                     batch = SampleBatch(row.machine, row.spool_id, row.first_seq, row.rows, reader.frame)

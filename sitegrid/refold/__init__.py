@@ -1,1 +1,1 @@
-"""Archives folded again into a new store: what they hold, which samples of it count, and who does the work."""
+"""Fold archives again into a new store: sources, selection, workers."""

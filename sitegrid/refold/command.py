@@ -1,7 +1,7 @@
-"""The samples of archives and stores, folded again with other parameters into a new store.
+"""Fold the samples of archives and stores again, with other parameters, into a new store.
 
-The new store has its samples in an archive, a journal that goes on after that, and a snapshot of the map. All of it is
-made in `OUT.part` and has its own name once it is whole.
+The new store has its samples in an archive, a journal that continues after it, and a snapshot. It is made in `OUT.part`
+and renamed when complete.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ from sitegrid.refold.work import Fold, FoldTask, PartWork, code_digest, fold_par
 
 
 def run(arguments: Namespace) -> int:
-    """Fold once and print what became of the samples."""
-    raise_interrupts()  # what is not complete is removed, or kept on purpose
+    """Fold once and print the outcome."""
+    raise_interrupts()  # incomplete output is removed, or kept for a restart
     summary = fold(arguments)
     say(summary) if arguments.json else tell(*_lines(summary))
     return 0
 
 
 def fold(arguments: Namespace) -> dict[str, Any]:
-    """Fold once; what became of the samples."""
+    """Fold once; returns the outcome."""
     selection = Selection(
         from_ns=arguments.from_ns or 0,
         to_ns=MAX_STAMP_NS if arguments.until_ns is None else arguments.until_ns - 1,
@@ -74,7 +74,7 @@ def fold(arguments: Namespace) -> dict[str, Any]:
 
 
 def _engine(arguments: Namespace, parts: int) -> AbstractContextManager[Engine]:
-    """Who does the work; never more processes than there are parts."""
+    """Never more processes than parts."""
     jobs = min(arguments.jobs, parts)
     return Cluster(arguments.engine or "", jobs) if arguments.engine or jobs > 1 else nullcontext(Here(THREADS))
 
@@ -82,7 +82,7 @@ def _engine(arguments: Namespace, parts: int) -> AbstractContextManager[Engine]:
 def _build(
     arguments: Namespace, sources: Sequence[Source], planned: Plan, site: SiteConfig, engine: Engine
 ) -> dict[str, Any]:
-    """Make the store beside its place, and put it there when it is complete."""
+    """Make the store beside its place and move it there when complete."""
     config, text = chosen_config(sources, arguments)
     decisions = joined_decisions(each.decisions for each in sources)
     decided = Decisions()
@@ -122,7 +122,7 @@ def _build(
 
 
 def _tasks(fold: Fold, planned: Plan, engine: Engine) -> Iterator[FoldTask]:
-    """Parts one behind the other, about TASK_SAMPLES at once; all of them where one process does the work."""
+    """Consecutive parts of about TASK_SAMPLES; one task for a single process."""
     row, samples = 1, 0
     parts: list[PartWork] = []
     for each, taken in zip(planned.contents, planned.taken, strict=True):
@@ -139,7 +139,7 @@ def _tasks(fold: Fold, planned: Plan, engine: Engine) -> Iterator[FoldTask]:
 
 @contextmanager
 def _progress(arguments: Namespace, tasks: Sequence[FoldTask]) -> Iterator[Callable[[int], None]]:
-    """Show on a terminal how many samples are folded; gives what is to be told the number of each task that is done."""
+    """Show progress on a terminal; yields a callback for finished task numbers."""
     if arguments.json or not sys.stderr.isatty() or not find_spec("rich"):
         yield lambda _: None
         return

@@ -1,8 +1,8 @@
-"""Who does the tasks of a fold: this process, or workers of Dask (dask.distributed) on this host or on many.
+"""Executors of a fold's tasks: this process, or Dask workers (dask.distributed) on one or many hosts.
 
-A task is a function and a value, and it may be done twice: what it writes has a name that says what is in it. Dask
-notices a dead worker and has its tasks done by others. What Dask waits for without an end is limited here: a worker
-that ends by `sys.exit` takes its nanny along, and no other comes in its place.
+A task is a function and a value, and may run twice: file names identify contents. Dask reschedules tasks of dead
+workers. Its endless waits get timeouts here: a worker that ends by `sys.exit` takes its nanny along and is not
+replaced.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from protocol.errors import ConfigError, SitegridError
 T = TypeVar("T")
 R = TypeVar("R")
 SCHEME = "dask://"
-TASK_SAMPLES = 4_000_000  # some seconds; the evidence of smaller tasks would take longer to merge than to fold
-TRIES = 3  # rounds in a row without any task done, before a fold is given up
-PATIENCE_S = 900.0  # without any task done: the largest take half a minute
+TASK_SAMPLES = 4_000_000  # some seconds; evidence of smaller tasks takes longer to merge than to fold
+TRIES = 3  # rounds in a row without progress before giving up
+PATIENCE_S = 900.0  # timeout without progress; the largest tasks take half a minute
 CONNECT_S = 20.0  # timeout of a scheduler, and of its first worker
-ALONE_S = 60.0  # without any worker: one that is asked to end finishes its task first, and then another one starts
-LOOK_S = 2.0  # between two checks of scheduler and workers
-LOST = "lost"  # status of a task whose worker died; another worker does it again
+ALONE_S = 60.0  # timeout without workers: a stopping worker finishes its task before its successor starts
+LOOK_S = 2.0  # between checks of scheduler and workers
+LOST = "lost"  # status of a dead worker's task, which another one repeats
 
 
 class EngineError(SitegridError):
-    """The workers are gone, or do nothing."""
+    """Workers are gone or idle."""
 
 
 class StalledError(Exception):
-    """The work did not go on, and may be tried again."""
+    """Work stalled; may be retried."""
 
 
 class Here:
-    """One task after the other, in the process that asks; a single one folds all, and nothing has to be merged.
+    """Tasks in sequence, in this process; a single one folds everything without merging.
 
-    threads: how many one task may use; task_samples: how many samples it folds, about.
+    threads: per task. task_samples: approximate size of a task.
     """
 
     task_samples = sys.maxsize
@@ -54,9 +54,9 @@ class Here:
         self.threads = threads
 
     def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
-        """Results of all tasks, in their order; done: is told the number of each that is done.
+        """Results of all tasks in order; done: called with each finished task's number.
 
-        Raises SitegridError where one fails, EngineError where nobody does them.
+        SitegridError if one fails, EngineError without workers.
         """
         results = []
         for number, task in enumerate(tasks):
@@ -66,14 +66,14 @@ class Here:
 
 
 class Cluster:
-    """Workers of one Dask scheduler; use it as a context."""
+    """Workers of one Dask scheduler, as a context."""
 
     threads, task_samples = 1, TASK_SAMPLES
 
     def __init__(self, address: str = "", jobs: int = 1) -> None:
-        """address: dask://HOST:PORT of a scheduler; without one, `jobs` workers of this host that end with the context.
+        """address: dask://HOST:PORT of a scheduler; else `jobs` local workers that end with the context.
 
-        Those of this host speak TLS with keys of their own: no other user of the host reaches them.
+        Local ones speak TLS with their own keys, so no other user of the host reaches them.
         """
         option = "--engine" if address else "--jobs"
         if address and not address.startswith(SCHEME):
@@ -85,7 +85,7 @@ class Cluster:
         self._address, self._jobs = address, jobs
         self._who = f"the workers of {address}" if address else "the processes of the fold"
         for name in (name for name in logging.root.manager.loggerDict if name.startswith("distributed")):
-            logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say at length is one line here
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # their long messages are one line here
         self._client: Any = None
         self._local: Any = None
         self._killed: type[Exception] = self._dask.scheduler.KilledWorker
@@ -102,11 +102,11 @@ class Cluster:
 
     def __exit__(self, *_: object) -> None:
         for opened in (self._client, self._local):
-            with suppress(Exception):  # of a scheduler that is gone
+            with suppress(Exception):  # the scheduler may be gone
                 opened.close(timeout=CONNECT_S)
 
     def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
-        """As `Here.each`; EngineError after TRIES rounds in a row in which no task was done."""
+        """As `Here.each`; EngineError after TRIES rounds without progress."""
         results: dict[int, R] = {}
         failures = 0
         while left := {number: task for number, task in enumerate(tasks) if number not in results}:
@@ -122,7 +122,6 @@ class Cluster:
         return [results[number] for number in range(len(tasks))]
 
     def _connected(self) -> Any:
-        """A client of the scheduler at the address."""
         place = self._address.removeprefix(SCHEME)
         host, _, port = place.rpartition(":")
         try:
@@ -135,20 +134,20 @@ class Cluster:
     def _started(self) -> Any:
         """A client of a scheduler in this process, with workers that die with it."""
         options: dict[str, Any] = {"memory_limit": 0, "silence_logs": logging.CRITICAL, "security": True}
-        options["dashboard_address"] = "127.0.0.1:0"  # there is no way without one; its usual port may be taken
-        known = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which what starts here inherits: Ctrl-C is for us alone
+        options["dashboard_address"] = "127.0.0.1:0"  # cannot be disabled; its usual port may be taken
+        known = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited by children: Ctrl-C is only ours
         try:
             self._local = self._dask.LocalCluster(n_workers=self._jobs, threads_per_worker=1, **options)
         finally:
             signal.signal(signal.SIGINT, known)
-        self._local.adapt(minimum=self._jobs, maximum=self._jobs, interval="1 s")  # a nanny may end with its worker
+        self._local.adapt(minimum=self._jobs, maximum=self._jobs, interval="1 s")  # replaces workers whose nanny ended
         return self._dask.Client(self._local, timeout=CONNECT_S)
 
     def _do(
         self, work: Callable[[T], R], tasks: Mapping[int, T], results: dict[int, R], done: Callable[[int], None]
     ) -> None:
-        """Do tasks until all are done; StalledError where none is done for a while."""
-        run = uuid4().hex[:8]  # a task that hangs is given to others under another name
+        """Run tasks to the end; StalledError without progress."""
+        run = uuid4().hex[:8]  # hung tasks are reassigned under new names
         waiting: dict[Any, int] = {}
         for number, task in tasks.items():
             key = f"{work.__name__}-{run}-{number}"
@@ -161,14 +160,14 @@ class Cluster:
                     number = waiting.pop(future)
                     results[number] = self._result(future)
                     done(number)
-        except (OSError, self._dask.client.FuturesCancelledError):  # its connection is closed, or it was another's
+        except (OSError, self._dask.client.FuturesCancelledError):  # connection closed, or cancelled elsewhere
             raise self._gone() from None
         finally:
-            with suppress(Exception):  # of a scheduler that is gone
+            with suppress(Exception):  # the scheduler may be gone
                 self._client.cancel(list(waiting), force=True)
 
     def _finished(self, futures: list[Any]) -> list[Any]:
-        """Some that are finished; StalledError where there are none for long, EngineError where nobody does them."""
+        """Some finished futures; StalledError after PATIENCE_S, EngineError without workers."""
         began_s = alone_s = time.monotonic()
         while True:
             with suppress(TimeoutError):
@@ -189,7 +188,7 @@ class Cluster:
         if future.status == "finished":
             return future.result(timeout=CONNECT_S)
         error = future.exception(timeout=CONNECT_S)
-        if isinstance(error, (SitegridError, self._killed)):  # several workers died while they did this task
+        if isinstance(error, (SitegridError, self._killed)):  # several workers died on this task
             raise error
         raise EngineError(f"one of {self._who} failed: {type(error).__name__}: {error}")
 
@@ -201,7 +200,7 @@ Engine = Here | Cluster
 
 
 def attempt(work: Callable[[T], R], task: T) -> R:
-    """Do a task, in whichever process this is; its error is a plain one, which survives the way to another process."""
+    """Run a task in any process; errors become plain ones that survive pickling."""
     try:
         return work(task)
     except (SitegridError, OSError, MemoryError) as error:
@@ -209,13 +208,13 @@ def attempt(work: Callable[[T], R], task: T) -> R:
 
 
 def _within(seconds: float, work: Callable[[], T]) -> T:
-    """What comes of work; TimeoutError in the end: to a port that says nothing a client connects for ever."""
+    """Result of work, or TimeoutError: clients connect to silent ports forever."""
     future: Future[T] = Future()
 
     def do() -> None:
         try:
             future.set_result(work())
-        except Exception as error:  # whatever it is, it is raised where it is waited for
+        except Exception as error:  # re-raised for the waiting thread
             future.set_exception(error)
 
     threading.Thread(target=do, name="connect", daemon=True).start()

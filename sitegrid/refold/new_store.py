@@ -1,4 +1,4 @@
-"""The new store of a fold, made in a folder beside its place: what a fold that was killed left there is used again."""
+"""The new store of a fold, made beside its place; a killed fold's results are reused."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from protocol.files import sync_folder, write_whole
 from protocol.site.site_config import SiteConfig
 from sitegrid.refold.work import STORE_FILE, PartWork
 
-WORK = "work"  # folder in that of the store, as long as it is in the making: see work.py
+WORK = "work"  # subfolder while in the making: see work.py
 
 
 @dataclass(frozen=True)
 class NewStore:
-    """A store in the making. id: its own; rows: the last one of its archive."""
+    """A store in the making. id: its own; rows: last archive row."""
 
     folder: Path
     id: str
@@ -42,11 +42,11 @@ class NewStore:
 
     @property
     def work(self) -> Path:
-        """Where tasks write."""
+        """Folder for tasks' files."""
         return self.folder / WORK
 
     def take_samples(self, files: Iterable[tuple[PartWork, Path]]) -> None:
-        """Have the samples of each part as a file of the archive."""
+        """Move each part's samples into the archive."""
         archive = self.folder / FOLDER
         archive.mkdir(exist_ok=True)
         for part, path in files:
@@ -54,13 +54,13 @@ class NewStore:
         sync_folder(archive)
 
     def save_map(self, state: GridState, config: ServerConfig, facts: Facts) -> None:
-        """Write the snapshot that the store starts from."""
+        """Write the first snapshot."""
         with JournalLocation(self.folder).reader() as journal:
             depends_on = StorePast.of_store(self.folder, self.site.cell_m, config.fold).depends_on(journal, facts)
         save_snapshot(self.folder, self.rows, depends_on(OPEN_END_NS), state)
 
     def fill_journal(self, watermarks: Mapping[SpoolKey, Watermark], decisions: Sequence[CalibrationDecision]) -> None:
-        """Have the journal go on after the archive, with the decisions about the samples in it."""
+        """Continue the journal after the archive, with the decisions about its samples."""
         with closing(JournalLocation(self.folder).open_file(self.site.name, self.site.frame)) as journal:
             if not journal.last_row:
                 journal.follow_archive(self.rows, watermarks)
@@ -71,7 +71,7 @@ class NewStore:
                 raise _of_another(self.folder)
 
     def finish(self, out: Path, texts: Mapping[str, str], config: ServerConfig) -> dict[str, Any]:
-        """Open the store as a server does, and put it in its place; texts: further files. Returns its `info`."""
+        """Open the store like a server, then move it into place; texts: further files. Returns its `info`."""
         for name, text in texts.items():
             write_whole(self.folder / name, text.encode())
         with closing(Store(JournalLocation(self.folder), self.site, config, time.time_ns)) as store:
@@ -84,7 +84,7 @@ class NewStore:
 
 @contextmanager
 def making(folder: Path, site: SiteConfig, descends: tuple[str, ...], rows: int) -> Iterator[NewStore]:
-    """Make a store in a folder, or go on with it; after an error nothing is left, or what the same command can use."""
+    """Make a store in a folder, or resume; an error leaves nothing, or what the same command can reuse."""
     with hold_place(folder):
         try:
             (folder / WORK).mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def making(folder: Path, site: SiteConfig, descends: tuple[str, ...], rows: int)
 
 
 def _identity(folder: Path, site: SiteConfig, descends: tuple[str, ...]) -> str:
-    """Id of the new store: that of an empty journal, which is made now or was made by the fold that was killed."""
+    """The new store's id: of an empty journal, made now or by a killed fold."""
     try:
         with closing(JournalLocation(folder).open_file(site.name, site.frame, descends)) as journal:
             identity = journal.identity()
@@ -121,5 +121,5 @@ def _of_another(folder: Path) -> ConfigError:
 
 
 def _is_useful(folder: Path) -> bool:
-    """Whether a fold that goes on would find work that is done."""
+    """Whether finished work can be reused."""
     return any((folder / WORK).glob("evidence-*"))

@@ -1,7 +1,7 @@
-"""Parts of archives, as one task reads each: a Parquet file, or a stretch of a journal that is not archived yet.
+"""Parts of archives, the unit of reading: a Parquet file, or a range of unarchived journal rows.
 
-They are values that other processes understand, and other hosts where their place is one that these reach, too. Which
-samples a part holds are intervals of numbers by spool, so that those of years fit into one process.
+They are values for other processes, and other hosts that reach their place. A part's samples are intervals of numbers
+by spool, so years of them fit into one process.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from protocol.machine.samples import COLUMNS, check_samples
 from protocol.site.site_config import MAX_EXTENT_M, SiteConfig
 from protocol.wire.keys import check_name
 
-SLICE_ROWS = 20_000  # of a journal: up to two million samples, as in a file
-HEADS = ("stamp_ns", "x_m", "y_m")  # of samples: all that is needed to choose among them
+SLICE_ROWS = 20_000  # of a journal: up to two million samples, like a file
+HEADS = ("stamp_ns", "x_m", "y_m")  # sample columns that suffice for selection
 Interval = tuple[int, int]  # first and last number
-Taken = Mapping[SpoolKey, tuple[Interval, ...]]  # disjoint, in order
+Taken = Mapping[SpoolKey, tuple[Interval, ...]]  # disjoint, sorted
 
 
 @dataclass(frozen=True)
 class PartOrigin:
-    """What a part says of itself. identity: hex digits that other contents do not have. site: where it is known."""
+    """A part's own description. identity: hex digits, unique to its contents. site: if known."""
 
     identity: str
     name: str
@@ -47,19 +47,19 @@ class PartOrigin:
 
 @dataclass(frozen=True)
 class FilePart:
-    """One file of an archive."""
+    """One archive file."""
 
     path: Path | FilePlace
 
     def origin(self) -> PartOrigin:
-        """What its header says."""
+        """Description from the header."""
         file = ArchiveFile(self.path)
         header = file.header
         identity = f"{file.identity}-{header.store}-{file.first_row}-{file.samples}"
         return PartOrigin(identity, header.site.name, header.frame, header.machines, (header.store,), header.site)
 
     def read(self, columns: Sequence[str] = COLUMNS) -> Iterator[JournalRows]:
-        """Its rows, with these columns of their samples at least; StoreError where it is damaged."""
+        """Its rows with at least these sample columns; StoreError if damaged."""
         return ArchiveFile(self.path).read_many(columns=columns)
 
     def __str__(self) -> str:
@@ -68,9 +68,9 @@ class FilePart:
 
 @dataclass(frozen=True)
 class JournalPart:
-    """Rows after < row <= until of a store's journal; those that are archived meanwhile are read from its archive.
+    """Rows after < row <= until of a store's journal; rows archived meanwhile come from its archive.
 
-    host: that alone can read it, empty where all can: SQLite's files are no good to others while a server writes.
+    host: the only one that can read it, empty: any; SQLite files in use are unreadable elsewhere.
     """
 
     location: JournalLocation
@@ -79,7 +79,7 @@ class JournalPart:
     host: str
 
     def origin(self) -> PartOrigin:
-        """What the journal says; its rows are read for their checksum."""
+        """Description from the journal, with a checksum of its rows."""
         with self._reader() as journal:
             store = journal.identity()
             crc32 = 0
@@ -90,7 +90,7 @@ class JournalPart:
             return PartOrigin(identity, journal.site, journal.frame, machines, (store.id,), None)
 
     def read(self, columns: Sequence[str] = COLUMNS) -> Iterator[JournalRows]:  # noqa: ARG002 # rows are whole records
-        """Its rows; StoreError where they are damaged."""
+        """Its rows; StoreError if damaged."""
         with self._reader() as journal:
             for rows in read_history(History(journal, self.location.archive), self.after, self.until):
                 try:
@@ -117,11 +117,10 @@ Part = FilePart | JournalPart
 
 @dataclass(frozen=True)
 class Contents:
-    """What one part holds of what is wanted.
+    """Wanted contents of one part.
 
-    rows, samples: that are kept, first_ns: when the first row was received. intervals: of the kept samples. reached:
-    the last number of each spool, kept or not. newest_ns: stamp of each spool's newest kept sample. excluded: how many
-    are not kept, by reason.
+    rows, samples: kept. first_ns: first row received. intervals: of kept samples. reached: each spool's last number,
+    kept or not. newest_ns: each spool's newest kept stamp. excluded: omitted samples by reason.
     """
 
     part: Part
@@ -137,7 +136,7 @@ class Contents:
 
 @dataclass(frozen=True)
 class LookTask:
-    """A task: look at a part. selection: machines and stamps; taken: numbers that another part has as well."""
+    """Task: survey a part. selection: machines and stamps. taken: numbers in other parts."""
 
     part: Part
     selection: Selection
@@ -145,7 +144,7 @@ class LookTask:
 
 
 def look(task: LookTask) -> Contents:
-    """Read through a part; StoreError where it is damaged."""
+    """Survey a part; StoreError if damaged."""
     origin = task.part.origin()
     first_ns, rows_kept, samples = 0, 0, 0
     excluded: Counter[str] = Counter(machine=0, time=0, twice=0)
@@ -168,7 +167,7 @@ def look(task: LookTask) -> Contents:
 
 
 def chosen(rows: JournalRows, selection: Selection, taken: Taken) -> tuple[Bools, Counter[str]]:
-    """Which samples (n,) of rows are kept, and how many are not, by reason: their machine, their time, or twice."""
+    """Mask of kept samples (n,), and counts of others by reason: machine, time, twice."""
     of_others = np.array([machine not in selection.without for machine in rows.machines], np.bool_)
     wanted = np.repeat(of_others[rows.machine], rows.lengths)
     in_time = selection.includes(rows.samples)
@@ -184,7 +183,7 @@ def chosen(rows: JournalRows, selection: Selection, taken: Taken) -> tuple[Bools
 
 
 def by_spool(rows: JournalRows) -> Iterator[tuple[SpoolKey, Ints, Ints]]:
-    """Each spool of rows, the numbers of its samples, and where they are in the table."""
+    """Spools of rows: sample numbers, and their indices in the table."""
     starts = np.cumsum(rows.lengths) - rows.lengths
     seqs = np.arange(len(rows.samples)) + np.repeat(rows.first_seqs - starts, rows.lengths)
     pairs = np.rec.fromarrays([rows.machine, rows.spool_ids])
@@ -198,7 +197,7 @@ def by_spool(rows: JournalRows) -> Iterator[tuple[SpoolKey, Ints, Ints]]:
 
 
 def _intervals(seqs: Ints) -> list[Interval]:
-    """Numbers as intervals; one that is there twice begins a new one."""
+    """Numbers as intervals; a repeated number starts a new one."""
     seqs = np.sort(seqs)
     edges = np.flatnonzero(np.diff(seqs) != 1)
     firsts, lasts = np.append(0, edges + 1), np.append(edges, len(seqs) - 1)
@@ -206,7 +205,7 @@ def _intervals(seqs: Ints) -> list[Interval]:
 
 
 def _joined(part: Part, spool: SpoolKey, intervals: list[Interval]) -> tuple[Interval, ...]:
-    """Intervals in order, those that touch as one; StoreError where two overlap."""
+    """Merge touching intervals, sorted; StoreError if two overlap."""
     out: list[Interval] = []
     for first, last in sorted(intervals):
         if out and first <= out[-1][1]:

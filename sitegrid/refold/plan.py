@@ -1,7 +1,7 @@
-"""What is to be folded: each sample once, in parts whose order does not depend on that of their names.
+"""Plan of a fold: every sample once, in parts ordered independently of file names.
 
-Samples have an identity, and folds merge where they share none. So a sample that is in two parts is taken out of the
-later one before anything is folded; that both are the same, bit for bit, is looked at first.
+Folds merge if they share no sample. A sample in two parts is removed from the later one, after checking that both are
+bit-identical.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sitegrid.refold.parts import Contents, Interval, LookTask, Part, by_spool, 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is folded. contents: of all parts, in order; taken: of each, the samples that an earlier part has."""
+    """contents: of all parts, in order. taken: per part, samples already in an earlier one."""
 
     contents: tuple[Contents, ...]
     taken: tuple[dict[SpoolKey, tuple[Interval, ...]], ...]
@@ -31,7 +31,7 @@ class Plan:
 
     @property
     def excluded(self) -> Counter[str]:
-        """Samples that are not kept, by reason."""
+        """Omitted samples by reason."""
         reasons = Counter(machine=0, time=0, twice=0)
         for each in self.contents:
             reasons.update(each.excluded)
@@ -39,7 +39,7 @@ class Plan:
 
     @property
     def kept(self) -> Counter[SpoolKey]:
-        """Kept samples of each spool."""
+        """Kept samples by spool."""
         counts: Counter[SpoolKey] = Counter()
         for each in self.contents:
             for spool, intervals in each.intervals.items():
@@ -47,9 +47,9 @@ class Plan:
         return counts
 
     def watermarks(self, reached: Iterable[tuple[SpoolKey, int]]) -> dict[SpoolKey, Watermark]:
-        """Of the new store: machines go on where they are, and what is not kept is lost.
+        """The new store's watermarks: machines continue, omitted samples count as lost.
 
-        reached: the last numbers of spools, as stores know them whose rows may not have been read.
+        reached: spools' last numbers from stores, whose rows may be unread.
         """
         seqs: Counter[SpoolKey] = Counter()
         newest_ns: Counter[SpoolKey] = Counter()
@@ -63,7 +63,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A task: samples that a part has as well as an earlier one."""
+    """Task: compare samples that two parts share."""
 
     part: Part
     earlier: Part
@@ -71,7 +71,7 @@ class Comparison:
 
 
 def plan(parts: Sequence[Part], selection: Selection, engine: Engine) -> Plan:
-    """LookTask through all parts; StoreError where a sample is in two of them with different contents."""
+    """Survey all parts; StoreError if a sample has different contents in two."""
     contents = engine.each(look, [LookTask(part, selection) for part in parts])
     _require_one_site(contents)
     contents.sort(key=lambda each: (each.first_ns, each.origin.machines, each.origin.identity, str(each.part)))
@@ -97,7 +97,7 @@ def _require_one_site(contents: Sequence[Contents]) -> None:
 
 
 def compare(task: Comparison) -> None:
-    """StoreError, with the sample's name, unless both parts have the same bytes."""
+    """StoreError naming the sample, unless both parts have equal bytes."""
     wanted: dict[SpoolKey, list[Interval]] = defaultdict(list)
     for spool, interval in task.overlaps:
         wanted[spool].append(interval)
@@ -115,7 +115,7 @@ def compare(task: Comparison) -> None:
 
 
 def _samples(part: Part, wanted: dict[SpoolKey, list[Interval]]) -> dict[tuple[str, int, int], Table]:
-    """Samples of intervals, as bytes, in the order of their numbers; by spool and first number."""
+    """Interval samples as bytes in number order, by spool and first number."""
     tables_of: dict[tuple[str, int, int], list[tuple[int, Table]]] = defaultdict(list)
     for rows in part.read():
         raw = rows.samples.view(RAW_SAMPLE)
@@ -130,8 +130,8 @@ def _samples(part: Part, wanted: dict[SpoolKey, list[Interval]]) -> dict[tuple[s
 
 
 def _overlaps(contents: Sequence[Contents]) -> Iterator[tuple[int, int, SpoolKey, Interval]]:
-    """What a part has as well as an earlier one: both parts' numbers, the spool, and which samples."""
-    held: defaultdict[SpoolKey, list[tuple[int, int, int]]] = defaultdict(list)  # first, last, part; disjoint, in order
+    """Samples shared with an earlier part: indices of both parts, spool, interval."""
+    held: defaultdict[SpoolKey, list[tuple[int, int, int]]] = defaultdict(list)  # first, last, part; disjoint, sorted
     for at, each in enumerate(contents):
         for spool, intervals in each.intervals.items():
             before = held[spool]
@@ -157,7 +157,7 @@ def _overlaps(contents: Sequence[Contents]) -> Iterator[tuple[int, int, SpoolKey
 def _comparisons(
     contents: Sequence[Contents], overlaps: Iterable[tuple[int, int, SpoolKey, Interval]]
 ) -> Iterator[Comparison]:
-    """Which parts are to be compared; a file that was named twice is the same as it is."""
+    """Pairs of parts to compare; a file named twice equals itself."""
     pairs: dict[tuple[int, int], list[tuple[SpoolKey, Interval]]] = defaultdict(list)
     for at, earlier, spool, interval in overlaps:
         if contents[at].origin.identity != contents[earlier].origin.identity:

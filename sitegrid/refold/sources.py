@@ -1,4 +1,4 @@
-"""What is folded, as the command line names it: files, folders of them, stores; their parts, site and decisions."""
+"""Sources of a fold from the command line: files, folders, stores; their parts, site and decisions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
 
 @dataclass(frozen=True)
 class Source:
-    """One archive that was named. stores: ids of those whose samples these are, or whose place that store took."""
+    """One named archive. stores: ids of its samples' stores, and of stores they replaced."""
 
     path: Path | FilePlace | JournalLocation
     parts: tuple[Part, ...]
@@ -43,7 +43,7 @@ class Source:
 
 
 def source(path: Path | FilePlace | JournalLocation) -> Source:
-    """What a Parquet file, a folder of them, a store or a journal in PostgreSQL holds; no samples are read yet."""
+    """Describe a Parquet file, a folder of them, a store or a PostgreSQL journal, without reading samples."""
     if isinstance(path, JournalLocation):
         return _store(path)
     path = path.absolute() if isinstance(path, Path) else path
@@ -60,7 +60,7 @@ def source(path: Path | FilePlace | JournalLocation) -> Source:
 
 
 def _store(location: JournalLocation) -> Source:
-    shortfall = None if location.is_shared else lacking(location)  # of a shared one its servers have the proof
+    shortfall = None if location.is_shared else lacking(location)  # a shared journal's servers keep the proof
     if shortfall:
         advice = "restore a backup, or start a map server on it once: it keeps a note of that, and goes on"
         raise StoreError(location, f"{shortfall}; {advice}")
@@ -81,7 +81,7 @@ def _store(location: JournalLocation) -> Source:
 
 
 def _site_of(store: Path) -> SiteConfig | None:
-    """The site as a store knows it: a file of its own, or the header of its newest archive."""
+    """A store's site: its own file, or the newest archive's header."""
     if (store / SITE_FILE).exists():
         return load_site(store / SITE_FILE)
     paths = JournalLocation(store).archive.paths()
@@ -89,7 +89,7 @@ def _site_of(store: Path) -> SiteConfig | None:
 
 
 def chosen_site(sources: Sequence[Source], contents: Sequence[Contents], arguments: Namespace) -> SiteConfig:
-    """The one site of all parts, with what the options change."""
+    """The common site of all parts, with the options' changes."""
     first = contents[0]
     given = load_site(arguments.site_file) if arguments.site_file else None
     known = [*(source.site for source in sources), *(each.origin.site for each in contents)]
@@ -106,7 +106,7 @@ def chosen_site(sources: Sequence[Source], contents: Sequence[Contents], argumen
 
 
 def chosen_config(sources: Sequence[Source], arguments: Namespace) -> tuple[ServerConfig, str]:
-    """The server's options and their text: from --config, else from the first store that has its own."""
+    """Server options and their text: --config, or the first store with its own."""
     kept = (each.path / CONFIG_FILE for each in sources if each.watermarks and isinstance(each.path, Path))
     path = arguments.config or next((file for file in kept if file.exists()), None)
     if not path:
@@ -115,11 +115,10 @@ def chosen_config(sources: Sequence[Source], arguments: Namespace) -> tuple[Serv
 
 
 def joined_decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[CalibrationDecision]:
-    """Those of all sources in the order of their stamps, whatever order the sources are given in.
+    """Decisions of all sources by stamp, independent of source order.
 
-    What two histories share, as a store and its archive do, counts once. A decision that one history has twice counts
-    twice: who corrects, takes that back, and corrects again, has corrected. Each history keeps its own order, also
-    where the site's clock went back.
+    Decisions common to two histories, like a store's and its archive's, count once; repetitions within one history
+    count (correct, undo, correct again). Each history keeps its order, even if the site's clock went back.
     """
     places: dict[tuple[CalibrationDecision, int], tuple[int, int]] = {}
     for history in histories:
@@ -134,7 +133,7 @@ def joined_decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list
 
 
 def descent(sources: Sequence[Source], contents: Sequence[Contents]) -> Iterator[str]:
-    """Ids of all stores that the new one is made from, each once."""
+    """Unique ids of all ancestor stores."""
     own = {part: each.origin.stores for each in contents for part in [each.part]}
     named = (store for each in sources for store in (*each.stores, *(s for part in each.parts for s in own[part])))
     yield from dict.fromkeys(named)

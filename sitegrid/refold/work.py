@@ -1,11 +1,10 @@
-"""The two tasks of a fold: some parts into samples of the new store and their evidence, and a tile of all evidence.
+"""The two tasks of a fold: parts to samples and evidence; all evidence of a tile, merged.
 
-    TOKEN.parquet                samples of one part, as they go into the new store's archive
-    evidence-TOKEN.checkpoint    the evidence of the parts of one task, block by block
-    tile-TOKEN.checkpoint        the evidence of one tile, of all tasks
+    TOKEN.parquet                samples of one part for the new archive
+    evidence-TOKEN.checkpoint    evidence of one task's parts, by block
+    tile-TOKEN.checkpoint        evidence of one tile, of all tasks
 
-They lie in the folder `work` of OUT.part. A token is a hash of all that a file depends on. So a file that is there is
-used as it is, whoever made it.
+They are in folder `work` of OUT.part. A token hashes everything the file depends on, so existing files are reused.
 """
 
 from __future__ import annotations
@@ -40,15 +39,15 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 from protocol.site.site_config import SiteConfig
 from sitegrid.refold.parts import Interval, Part, chosen
 
-TILES = 64  # at most, and at least 4, as no tile lies across an axis: that many processes can merge
+TILES = 64  # upper bound of merging processes; at least 4, as no tile crosses an axis
 LEAST_TILE = 8  # blocks: 128 cells
-MERGED_AT_ONCE = 8  # evidence of so many tasks waits for the next sum
-STORE_FILE = "store-id"  # beside them: which store they are for
+MERGED_AT_ONCE = 8  # tasks whose evidence waits for the next sum
+STORE_FILE = "store-id"  # beside them: the store they belong to
 
 
 @dataclass(frozen=True)
 class Fold:
-    """What every task of one fold has in common. code: of the program that planned it; store: id of the new store."""
+    """Common to all tasks of a fold. code: digest of the planning program; store: new store's id."""
 
     folder: Path
     store: str
@@ -59,7 +58,7 @@ class Fold:
     code: str
 
     def check(self) -> None:
-        """StoreError unless this process is of the same program, and sees the folder of the fold."""
+        """StoreError unless this process runs the same program and sees the fold's folder."""
         here = socket.gethostname()
         if (code := code_digest()) != self.code:
             problem = (
@@ -73,7 +72,7 @@ class Fold:
         raise StoreError(self.folder, problem)
 
     def token(self, *words: object) -> str:
-        """Hex digits for a file that depends on the fold and on these words."""
+        """Hex digits that identify the fold and these words."""
         chosen = (self.selection.from_ns, self.selection.to_ns, sorted(self.selection.without))
         facts = (self.code, self.store, self.site, self.config, chosen, self.corrections.digest())
         return hashlib.sha256(repr((facts, words)).encode()).hexdigest()[:24]
@@ -81,7 +80,7 @@ class Fold:
 
 @dataclass(frozen=True)
 class PartWork:
-    """A part to fold. row: number of its first kept row in the new store, of `rows`; taken: what an earlier one has."""
+    """A part to fold. row: first kept row in the new store, of `rows`. taken: samples of earlier parts."""
 
     part: Part
     identity: str
@@ -94,7 +93,7 @@ class PartWork:
 
 @dataclass(frozen=True)
 class FoldTask:
-    """Parts, and how many threads may fold them."""
+    """Parts, and threads to fold them."""
 
     fold: Fold
     parts: tuple[PartWork, ...]
@@ -102,20 +101,20 @@ class FoldTask:
 
     @property
     def evidence(self) -> Path:
-        """The file of their evidence."""
+        """Their evidence file."""
         return (
             self.fold.folder
             / f"evidence-{self.fold.token(*((p.identity, p.row, p.taken) for p in self.parts))}.checkpoint"
         )
 
     def samples(self, part: PartWork) -> Path:
-        """The file of one part's samples."""
+        """One part's sample file."""
         return self.fold.folder / f"{self.fold.token(part.identity, part.row, part.taken)}.parquet"
 
 
 @dataclass(frozen=True)
 class TileTask:
-    """A tile, in blocks: first column and row, and its edge; the files of all evidence."""
+    """A tile in blocks: first column, row, edge; all evidence files."""
 
     fold: Fold
     column: int
@@ -125,13 +124,13 @@ class TileTask:
 
     @property
     def path(self) -> Path:
-        """The file of its evidence."""
+        """Its evidence file."""
         names = (path.name for path in self.evidence)
         return self.fold.folder / f"tile-{self.fold.token(self.column, self.row, self.edge, *names)}.checkpoint"
 
 
 def fold_parts(task: FoldTask) -> None:
-    """Fold parts and write their samples, unless that is done. StoreError where a part is damaged."""
+    """Fold parts and write their samples, unless done. StoreError if a part is damaged."""
     task.fold.check()
     if all(path.exists() for path in (task.evidence, *map(task.samples, task.parts))):
         return
@@ -141,7 +140,7 @@ def fold_parts(task: FoldTask) -> None:
 
 
 def merge_tile(task: TileTask) -> None:
-    """Merge what all tasks have of one tile, unless that is done."""
+    """Merge all tasks' evidence of a tile, unless done."""
     task.fold.check()
     if task.path.exists():
         return
@@ -153,12 +152,12 @@ def merge_tile(task: TileTask) -> None:
             blocks = tuple(checkpoint.blocks(checkpoint.numbers_in(window)))
         grid.merge(Grid.from_state(grid.cell_m, grid.config, GridState(blocks, 0, 0, 0, 0)))
         if number % MERGED_AT_ONCE == 0:
-            grid.state()  # sums what waits
+            grid.state()  # sums pending evidence
     _write(task.path, task.fold.store, grid.state())
 
 
 def tiles(fold: Fold, evidence: Sequence[Path]) -> Iterator[TileTask]:
-    """Tiles that cover all evidence, TILES at most; their edges depend on nothing but where that lies."""
+    """At most TILES tiles over all evidence; edges depend on its extent only."""
     x, y = _places(evidence)
     edge = LEAST_TILE
     while len(corners := {(a // edge, b // edge) for a, b in set(zip(x.tolist(), y.tolist(), strict=True))}) > TILES:
@@ -168,7 +167,7 @@ def tiles(fold: Fold, evidence: Sequence[Path]) -> Iterator[TileTask]:
 
 
 def merged_state(evidence: Sequence[Path], parts: Sequence[Path]) -> GridState:
-    """The state of the whole grid. evidence: whose numbers sum up to its own; parts: whose blocks are all it has."""
+    """State of the whole grid. evidence: for the totals. parts: for the blocks."""
     headers = []
     for path in evidence:
         with opened(path) as checkpoint:
@@ -187,7 +186,7 @@ def merged_state(evidence: Sequence[Path], parts: Sequence[Path]) -> GridState:
 
 
 def opened(path: Path) -> Checkpoint:
-    """Open a file of evidence; StoreError, and the file is gone, where it is damaged."""
+    """Open an evidence file; if damaged, delete it and raise StoreError."""
     try:
         return Checkpoint(path)
     except DamagedError:
@@ -199,7 +198,7 @@ def opened(path: Path) -> Checkpoint:
 
 @cache
 def code_digest() -> str:
-    """Hex digits of the program's text that decides about evidence: its version is too coarse for bits."""
+    """Digest of the code that determines evidence; a version is too coarse for bit equality."""
     digest = hashlib.sha256()
     for package in (protocol, mapserver):
         root = Path(str(package.__file__)).parent
@@ -210,7 +209,7 @@ def code_digest() -> str:
 
 
 def _samples(task: FoldTask) -> Generator[tuple[Table, NDArray[np.uint64]], None, None]:
-    """Samples of all parts, corrected, piece by piece; each part's file is written on the way."""
+    """Corrected samples of all parts in pieces; writes the parts' files on the way."""
     selection = Selection(corrections=task.fold.corrections)
     for part in task.parts:
         try:
@@ -228,7 +227,7 @@ def _samples(task: FoldTask) -> Generator[tuple[Table, NDArray[np.uint64]], None
 
 
 def _kept(fold: Fold, part: PartWork) -> Iterator[JournalRows]:
-    """The rows of a part as the new store numbers them."""
+    """A part's rows, renumbered."""
     number = part.row
     for rows in part.part.read():
         kept, _ = chosen(rows, fold.selection, dict(part.taken))
@@ -248,7 +247,7 @@ def _write(path: Path, store: str, state: GridState) -> None:
 
 
 def _places(evidence: Sequence[Path]) -> tuple[Ints, Ints]:
-    """Columns and rows of all blocks, some more than once."""
+    """Columns and rows of all blocks, with repetitions."""
     xs, ys = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for path in evidence:
         with opened(path) as checkpoint:

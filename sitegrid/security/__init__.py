@@ -1,1 +1,1 @@
-"""Who is let in: certificates, the register of names, access rules, signatures."""
+"""Access: certificates, name register, access rules, signatures."""

@@ -1,7 +1,7 @@
-"""Access control of the router: Zenoh's rules, size limits and rate limits, made from the register.
+"""The router's access control: Zenoh rules, size and rate limits from the register.
 
-Whatever is not granted is denied. Zenoh compares by inclusion: a granted `machine/a/**` does not let `machine/*/pose`
-pass. Exact keys are those of `protocol.wire.keys`; the patterns here serve for granting only.
+What is not granted is denied. Zenoh compares by inclusion: a grant of `machine/a/**` does not allow `machine/*/pose`.
+Exact keys: `protocol.wire.keys`; patterns here only serve grants.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from protocol.wire.codec import MAX_BATCH_BYTES, MAX_BUNDLE_BYTES, MAX_CORRECTIO
 from protocol.wire.fields import MAX_SMALL_BYTES
 from sitegrid.security.register import Register, common_name
 
-POSE_HZ, HEALTH_HZ = 50.0, 10.0  # of one link; poses come with 5 Hz, at ten times real time with 50
-SPARE_BYTES = 4096  # for attachments of a payload, as a signature
+POSE_HZ, HEALTH_HZ = 50.0, 10.0  # per link; poses come at 5 Hz, at 50 in ten times real time
+SPARE_BYTES = 4096  # for attachments, like signatures
 
 Keys = tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Grant:
-    """Key expressions that one name may publish, subscribe to, query and answer as a queryable.
+    """Keys that one name may publish, subscribe to, query and answer.
 
-    alive: it may show a liveliness token. watch: it may see the tokens of others.
+    alive: own liveliness token. watch: tokens of others.
     """
 
     publish: Keys = ()
@@ -36,7 +36,7 @@ class Grant:
 
 
 def grant(role: str, site: str, name: str) -> Grant:
-    """What the holder of a role may do under its name."""
+    """Rights of a role under its name."""
     map_all, poses, health = _whole(site, "map"), keys.poses_all(site), keys.health_all(site)
     asks, alive = (keys.map_queries_all(site), keys.follower_queries_all(site)), (keys.alive(site, name),)
     followers = keys.followers_alive_all(site)
@@ -50,7 +50,7 @@ def grant(role: str, site: str, name: str) -> Grant:
             publish=(_whole(site, "machine", name),),
             subscribe=(keys.sensors(site, name), map_all, keys.corrections_all(site)),
             query=(keys.ingest(site, name), *asks, *alive),
-            answer=alive,  # who holds the name, if a second one comes
+            answer=alive,  # the name's holder, for a second claimant
             alive=alive,
             watch=(*alive, followers),
         ),
@@ -80,13 +80,13 @@ def grant(role: str, site: str, name: str) -> Grant:
 
 
 def router_settings(register: Register) -> dict[str, Any]:
-    """The settings of the router's session, from the register."""
+    """Router session settings from the register."""
     limits = {"low_pass_filter": size_limits(register.site), "downsampling": [_rate_limits(register.site)]}
     return {"access_control": access_control(register), **limits}
 
 
 def access_control(register: Register) -> dict[str, Any]:
-    """Rules per certificate: nobody may do anything that is not granted to the name it proves."""
+    """Rules per certificate: only grants to its name."""
     rules, subjects, policies = [], [], []
     for name, entry in sorted(register.admitted().items()):
         own = _rules(name, register.site, grant(entry.role, register.site, name))
@@ -98,9 +98,9 @@ def access_control(register: Register) -> dict[str, Any]:
 
 
 def size_limits(site: str) -> list[dict[str, Any]]:
-    """Largest payloads that the router takes in; it drops larger ones without a word.
+    """Payload limits; the router drops larger ones silently.
 
-    Zenoh's own setting `rx/max_message_size` has no effect. Answers of the map server are not limited.
+    Zenoh's setting `rx/max_message_size` has no effect. Map server answers are unlimited.
     """
     limits = (
         ("batches", ["query"], keys.ingest_all(site), MAX_BATCH_BYTES + SPARE_BYTES),
@@ -120,7 +120,7 @@ def size_limits(site: str) -> list[dict[str, Any]]:
 
 
 def _rate_limits(site: str) -> dict[str, Any]:
-    """Limits for messages that may get lost; a limit on acknowledged ones would lose samples."""
+    """Rate limits for unacknowledged messages only; on others they would lose samples."""
     rates = (
         (keys.poses_all(site), POSE_HZ),
         (keys.corrections_all(site), POSE_HZ),
@@ -142,7 +142,7 @@ def _rules(name: str, site: str, granted: Grant) -> list[dict[str, Any]]:
         ("ingress", ("liveliness_token",), granted.alive),
         ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), granted.watch),
         ("egress", ("liveliness_token", "reply"), granted.watch),
-        # who subscribes and answers: without these declarations nobody sends, and they hold key expressions only
+        # these declarations make peers send; they contain key expressions only
         ("egress", ("declare_subscriber", "declare_queryable"), (_whole(site),)),
     )
     return [
@@ -159,7 +159,7 @@ def _rules(name: str, site: str, granted: Grant) -> list[dict[str, Any]]:
 
 
 def _whole(site: str, *parts: str) -> str:
-    """Everything below a place in the keys of a site."""
+    """All keys below a place."""
     return "/".join((keys.ROOT, site, *parts, "**"))
 
 

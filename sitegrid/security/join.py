@@ -1,4 +1,4 @@
-"""Settings with which a command joins the network: with its keys, or without keys and then on this host only."""
+"""Session settings of a command: with keys, or without keys on this host only."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ if TYPE_CHECKING:
 def join(
     endpoint: str, keys: Path | None = None, wait_s: float = 5.0, *, role: str = "", name: str = "", site: str = ""
 ) -> SessionConfig:
-    """Settings of a session with the router at `endpoint`; with keys, the default endpoint is the one with TLS.
+    """Session settings for the router at `endpoint`; with keys the default endpoint is the TLS one.
 
-    role, name, site: what the keys have to be for, where that matters. ConfigError says so of those that are not:
-    the router would refuse them without a word.
+    role, name, site: required of the keys, if given; else ConfigError, because the router would refuse silently.
     """
     try:
         if keys is None:
@@ -38,7 +37,7 @@ def join(
 
 
 def reply_check(keys: Path | None) -> Callable[[str, bytes, bytes, bytes], bool] | None:
-    """What checks replies to a machine's batches, if its folder has the keys of map servers and one to sign with."""
+    """Checker of replies to a machine's batches, if its folder has the servers' keys and a signing key."""
     if not keys or not (keys / SIGNING_FILE).is_file() or not (keys / SERVERS_FILE).is_file():
         return None
     from sitegrid.security.signing import ReplyVerifier
@@ -47,22 +46,22 @@ def reply_check(keys: Path | None) -> Callable[[str, bytes, bytes, bytes], bool]
 
 
 def signer(keys: Path | None) -> Signer | None:
-    """What signs a machine's batches or a server's replies, if its folder of keys has a signing key."""
+    """Signer of a machine's batches or a server's replies, if its folder has a signing key."""
     file = keys / SIGNING_FILE if keys else None
     if not file or not file.is_file():
         return None
-    from sitegrid.security.signing import Signer  # imported here: only those with keys need `cryptography`
+    from sitegrid.security.signing import Signer  # `cryptography` is needed with keys only
 
     return Signer(file.read_bytes())
 
 
 def with_keys(endpoint: str) -> str:
-    """The endpoint to use with keys: the default one becomes that with TLS."""
+    """With keys the default endpoint becomes the TLS one."""
     return DEFAULT_TLS_ENDPOINT if endpoint == DEFAULT_ENDPOINT else endpoint
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether only processes of this host reach a TCP endpoint; False where that is not certain."""
+    """Whether a TCP endpoint is reachable from this host only; False if uncertain."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     if protocol != "tcp" or not port.isdecimal():

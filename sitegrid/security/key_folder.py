@@ -1,13 +1,11 @@
-"""The folder of a site's keys: private files, written whole or not at all. Needs `cryptography`.
+"""A site's key folder: private files, written atomically. Needs `cryptography`.
 
-KEYS/register.toml     who has which role; the router makes its rules from it
-KEYS/authority/        the authority's certificate and key: whoever has the key can make any name
-KEYS/<name>/           what the process of that name needs, and no other
+    KEYS/register.toml     names and roles, from which the router makes its rules
+    KEYS/authority/        the authority's certificate and key, which can create any name
+    KEYS/<name>/           files for the process of that name only
 
-X.509 certificates of one site: the authority's, and those that it signs. Needs `cryptography`; touches no files.
-
-P-256 with SHA-256, PKCS #8 keys without a password. The router's certificate is a server's (TLS server authentication),
-all others are clients': a stolen machine cannot act as the router.
+X.509, P-256 with SHA-256, PKCS #8 keys without password. The router has a server certificate (TLS server
+authentication), all others client certificates: a stolen machine cannot pose as the router.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ from sitegrid.security.register import ROUTER, Register, RegisterEntry, common_n
 from sitegrid.security.signing import make_signing_key
 
 AUTHORITY = "authority"
-EARLY = timedelta(minutes=10)  # valid from before now: the clocks of machines differ
+EARLY = timedelta(minutes=10)  # backdating for clock differences
 UNUSED = (
     "content_commitment",
     "key_encipherment",
@@ -49,9 +47,9 @@ UNUSED = (
 
 
 def make_folder(folder: Path, site: str, now: datetime) -> None:
-    """Make the folder with the authority of a site."""
+    """Create the folder with a site's authority."""
     _private_folder(folder)
-    write_private(folder / ".gitignore", b"*\n")  # keys belong into no repository
+    write_private(folder / ".gitignore", b"*\n")  # keys belong in no repository
     _private_folder(folder / AUTHORITY)
     authority = make_authority(site, now, now + timedelta(days=3650))
     write_private(folder / AUTHORITY / KEY_FILE, authority.key)
@@ -59,7 +57,7 @@ def make_folder(folder: Path, site: str, now: datetime) -> None:
 
 
 def certify(folder: Path, register: Register, name: str, role: str, expires: datetime, now: datetime) -> Register:
-    """Write the folder of a name, then the register: only what that lists is let in."""
+    """Write a name's folder, then the register, which alone admits names."""
     authority = _authority(folder)
     number = register.next_issue(name)
     hosts = register.hosts if role == ROUTER else ()
@@ -81,7 +79,7 @@ def certify(folder: Path, register: Register, name: str, role: str, expires: dat
 
 
 def _signing_key(folder: Path, register: Register, name: str, role: str) -> tuple[bytes, str]:
-    """What it signs with, private and public; a map server keeps its own, which all machines know, while it is here."""
+    """Signing key, private and public; a map server keeps its own, known to all machines, while its file exists."""
     known, file = register.names.get(name), folder / name / SIGNING_FILE
     if role == "server" and known and known.signing and not known.revoked and file.is_file():
         return file.read_bytes(), known.signing
@@ -106,19 +104,19 @@ def _private_folder(path: Path) -> None:
 
 @dataclass(frozen=True)
 class KeyPair:
-    """A certificate and its private key, both PEM."""
+    """Certificate and private key, PEM."""
 
     certificate: bytes
     key: bytes
 
     @property
     def serial(self) -> str:
-        """The serial number of the certificate, as hex digits."""
+        """Certificate serial number, hex."""
         return f"{_certificate(self).serial_number:x}"
 
 
 def make_authority(site: str, begins: datetime, expires: datetime) -> KeyPair:
-    """Make the authority of a site: it signs certificates, and no further authorities."""
+    """Create a site's authority, for certificates only, without sub-authorities."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"sitegrid {site} authority")
     builder = _builder(name, name, key, begins, expires, is_authority=True)
@@ -128,9 +126,9 @@ def make_authority(site: str, begins: datetime, expires: datetime) -> KeyPair:
 def issue(
     authority: KeyPair, common_name: str, begins: datetime, expires: datetime, hosts: Sequence[str] = ()
 ) -> KeyPair:
-    """Make a key and have the authority sign it.
+    """Create a key and certificate.
 
-    hosts: names and addresses that it serves at; none: it only connects.
+    hosts: names and addresses it serves; none: client only.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     issuer = _certificate(authority)
@@ -148,7 +146,7 @@ def issue(
 
 
 def expires_at(pair: KeyPair) -> datetime:
-    """The end of a certificate's validity, UTC."""
+    """End of validity, UTC."""
     return _certificate(pair).not_valid_after_utc
 
 

@@ -1,7 +1,7 @@
-"""The register of a site's names, as TOML: role, end of validity, and who is revoked.
+"""A site's name register (TOML): roles, validity, revocations.
 
-The router makes its rules from it, by the common names of certificates. A name that was revoked and is added again gets
-a new common name, so that the old certificate stays refused.
+The router's rules follow from it by the certificates' common names. A revoked name that is added again gets a new
+common name, so the old certificate stays refused.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from protocol.files import load_sealed_toml, sealed, write_whole
 from protocol.wire.keys import check_name
 
 REGISTER_FILE = "register.toml"
-ROUTER = "router"  # a name and a role: one per site
+ROUTER = "router"  # name and role, one per site
 ROLES = ("machine", "corrections", "visitor", "server", "follower", "admin", "sim")
 
 
@@ -25,8 +25,8 @@ ROLES = ("machine", "corrections", "visitor", "server", "follower", "admin", "si
 class RegisterEntry:
     """One name.
 
-    serial: of its newest certificate, hex. issue: 1, and one more each time it comes back from revoked. signing: the
-    public key that its batches or replies are signed with, base64; none where it sends none.
+    serial: of the newest certificate, hex. issue: 1, plus 1 per return from revocation. signing: public key of its
+    batches or replies, base64; empty if it sends none.
     """
 
     role: str
@@ -47,36 +47,36 @@ class RegisterEntry:
 
 @dataclass(frozen=True)
 class Register:
-    """All names of one site. hosts: names and addresses of the router."""
+    """All names of one site. hosts: the router's names and addresses."""
 
     site: str
     hosts: tuple[str, ...]
     names: Mapping[str, RegisterEntry]
 
     def admitted(self) -> dict[str, RegisterEntry]:
-        """Names that may connect: all but the revoked ones and the router."""
+        """Names that may connect: neither revoked nor the router."""
         return {name: entry for name, entry in self.names.items() if not entry.revoked and entry.role != ROUTER}
 
     def signing_keys(self) -> dict[str, str]:
-        """Public keys of the machines whose batches are accepted."""
+        """Public keys of accepted machines."""
         entries = self.admitted().items()
         return {name: entry.signing for name, entry in entries if entry.signing and entry.role == "machine"}
 
     def server_keys(self) -> list[str]:
-        """Public keys of the map servers, whose replies are believed."""
+        """Public keys of trusted map servers."""
         return [entry.signing for entry in self.admitted().values() if entry.signing and entry.role == "server"]
 
     def next_issue(self, name: str) -> int:
-        """The issue that a new certificate of this name belongs to."""
+        """Issue of a new certificate for this name."""
         known = self.names.get(name)
         return 1 if known is None else known.issue + known.revoked
 
     def with_entry(self, name: str, entry: RegisterEntry) -> Register:
-        """With a name added or replaced."""
+        """Add or replace a name."""
         return replace(self, names={**self.names, name: entry})
 
     def without(self, name: str) -> Register:
-        """With a name revoked; ConfigError where that is not possible."""
+        """Revoke a name; ConfigError if impossible."""
         entry = self.names.get(name)
         if entry is None:
             raise ConfigError("keys", f"{name!r} is not in the register; see `sitegrid keys list`")
@@ -86,12 +86,12 @@ class Register:
 
 
 def common_name(name: str, issue: int) -> str:
-    """The common name of a certificate; names hold no dot, so two names never give the same one."""
+    """Common name of a certificate; unique, because names have no dots."""
     return name if issue == 1 else f"{name}.{issue}"
 
 
 def load_register(folder: Path) -> Register:
-    """Read the register of a folder of keys; ConfigError where it is none."""
+    """Read a key folder's register; ConfigError if invalid."""
     path = folder / REGISTER_FILE
     if not path.is_file():
         raise ConfigError(folder, f"holds no {REGISTER_FILE}: make the folder with `sitegrid keys init --dir {folder}`")
@@ -102,12 +102,12 @@ def load_register(folder: Path) -> Register:
 
 
 def save_register(folder: Path, register: Register) -> None:
-    """Write the register into a folder of keys, whole or not at all."""
+    """Write the register atomically."""
     write_private(folder / REGISTER_FILE, register_toml(register).encode())
 
 
 def write_private(path: Path, data: bytes) -> None:
-    """Write a file that only its owner reads, whole or not at all; ConfigError where that is not possible."""
+    """Write an owner-only file atomically; ConfigError on failure."""
     try:
         write_whole(path, data, 0o600)
     except OSError as error:
@@ -115,7 +115,7 @@ def write_private(path: Path, data: bytes) -> None:
 
 
 def register_toml(register: Register) -> str:
-    """The register as TOML, with a checksum: a flipped bit must let nobody in."""
+    """The register as TOML with a checksum: a flipped bit must admit nobody."""
     lines = ["# Who is let in. Written by `sitegrid keys`."]
     lines += toml_lines({"site": register.site, "hosts": list(register.hosts)})
     for name, entry in sorted(register.names.items()):

@@ -1,9 +1,8 @@
-"""Ed25519 signatures over batches and replies: nobody on the way, not even the router, can forge or alter one.
+"""Ed25519 signatures of batches and replies, safe from everyone on the way, the router included.
 
-The signature is the attachment of the query; the bytes of the batch stay the same, and a server without signatures
-ignores it. Key expression and payload are signed, so that a batch is valid for one machine of one site. A replay
-does no harm: the map server knows each sample by its number. The reply to a signed batch is signed together with that
-batch, so that it answers no other one. Needs `cryptography`.
+The signature is the query's attachment; servers without signatures ignore it. Key expression and payload are signed, so
+a batch is valid for one machine of one site. Replays are harmless: samples are numbered. A reply is signed with its
+batch, so it answers no other. Needs `cryptography`.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from protocol.errors import ConfigError, MessageError, Refusal
 
-_CONTEXT = b"sitegrid batch 1\0"  # a signature of something else is not valid for a batch
+_CONTEXT = b"sitegrid batch 1\0"  # domain separation
 _REPLY_CONTEXT = b"sitegrid reply 1\0"
 
 
 class Signer:
-    """Signs the batches of one machine, or the replies of a map server.
+    """Signs a machine's batches, or a map server's replies.
 
-    private_key: PEM; ConfigError where it is no Ed25519 key.
+    private_key: PEM; ConfigError unless Ed25519.
     """
 
     def __init__(self, private_key: bytes) -> None:
@@ -39,34 +38,34 @@ class Signer:
         self._key = key
 
     def sign(self, key_expression: str, payload: bytes) -> bytes:
-        """The signature of a batch that is sent to a key, 64 bytes."""
+        """Signature of a batch sent to a key, 64 bytes."""
         return self._key.sign(_signed(key_expression, payload))
 
     def sign_reply(self, key_expression: str, payload: bytes, reply: bytes) -> bytes:
-        """The signature of the reply to a batch that came to a key, 64 bytes."""
+        """Signature of the reply to a batch, 64 bytes."""
         return self._key.sign(_signed_reply(key_expression, payload, reply))
 
 
 class ReplyVerifier:
-    """Checks the signatures of replies. public_keys: of the site's map servers, base64 of 32 bytes each."""
+    """Verifies replies. public_keys: of the site's map servers, base64 of 32 bytes each."""
 
     def __init__(self, public_keys: Iterable[str]) -> None:
         self._keys = [_public_key("a map server", text) for text in public_keys]
 
     def is_genuine(self, key_expression: str, payload: bytes, reply: bytes, signature: bytes) -> bool:
-        """Whether a map server of the site has given this reply to this batch."""
+        """Whether a map server of the site gave this reply to this batch."""
         signed = _signed_reply(key_expression, payload, reply)
         return any(_fits(key, signature, signed) for key in self._keys)
 
 
 class Verifier:
-    """Checks signatures. public_keys: by machine, base64 of 32 bytes each, as the register has them."""
+    """Verifies batches. public_keys: by machine, base64 of 32 bytes each."""
 
     def __init__(self, public_keys: Mapping[str, str]) -> None:
         self._keys = {machine: _public_key(machine, text) for machine, text in public_keys.items()}
 
     def check(self, machine: str, key_expression: str, payload: bytes, signature: bytes) -> None:
-        """MessageError unless the machine has signed this payload for this key."""
+        """MessageError unless the machine signed this payload for this key."""
         key = self._keys.get(machine)
         if key is None:
             raise MessageError(Refusal.WRONG_MACHINE, f"no signing key of {machine!r} is in the register")
@@ -78,7 +77,7 @@ class Verifier:
 
 
 def make_signing_key() -> tuple[bytes, str]:
-    """A new key: the private part as PEM, the public part as the register keeps it."""
+    """A new key: private part as PEM, public part as in the register."""
     key = Ed25519PrivateKey.generate()
     form, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     private = key.private_bytes(serialization.Encoding.PEM, form, plain)

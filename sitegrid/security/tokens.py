@@ -1,6 +1,6 @@
-"""Tokens of people who may see the page: one per person, kept as hashes behind a checksum, revoked one by one.
+"""Personal tokens for the page, stored as hashes with a checksum, revocable one by one.
 
-A token is 128 random bits, so that a plain SHA-256 of it cannot be turned back.
+A token has 128 random bits, so plain SHA-256 is safe.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ log = logging.getLogger("sitegrid.security.tokens")
 
 @dataclass(frozen=True)
 class TokenEntry:
-    """One person's token: its SHA-256, hex, and until when it counts."""
+    """One token: SHA-256, hex, and expiry."""
 
     sha256: str
     expires: datetime
@@ -39,36 +39,36 @@ class TokenEntry:
 
 @dataclass(frozen=True)
 class Tokens:
-    """Who may see the page."""
+    """Persons who may see the page."""
 
     names: Mapping[str, TokenEntry] = field(default_factory=dict)
 
     def person(self, token: str, now: datetime) -> str | None:
-        """Whose token this is; None where it is nobody's, or no longer counts."""
+        """A token's person; None if unknown or expired."""
         digest = _digest(token)
         holders = [name for name, entry in self.names.items() if hmac.compare_digest(entry.sha256, digest)]
         return next((name for name in holders if self.names[name].expires > now), None)
 
     def with_new(self, name: str, expires: datetime) -> tuple[Tokens, str]:
-        """With a new token for a person, in place of an older one; and the token, which nothing keeps."""
+        """Replace a person's token; returns the new one, which is not stored."""
         token = secrets.token_urlsafe(16)
         return replace(self, names={**self.names, name: TokenEntry(_digest(token), expires)}), token
 
     def without(self, name: str) -> Tokens:
-        """Without a person's token; ConfigError where there is none."""
+        """Remove a person's token; ConfigError without one."""
         if name not in self.names:
             raise ConfigError("web", f"{name!r} has no token")
         return replace(self, names={key: entry for key, entry in self.names.items() if key != name})
 
 
 def load_tokens(folder: Path) -> Tokens:
-    """The tokens in a folder of keys; none where nobody has one yet."""
+    """Tokens of a key folder, empty without a file."""
     path = folder / TOKENS_FILE
     return from_table(Tokens, load_sealed_toml(path), str(path)) if path.is_file() else Tokens()
 
 
 def save_tokens(folder: Path, tokens: Tokens) -> None:
-    """Write the tokens into a folder of keys, whole or not at all."""
+    """Write the tokens atomically."""
     lines = ["# Who may see the live page. Written by `sitegrid keys`."]
     for name, entry in sorted(tokens.names.items()):
         lines += ["", f"[names.{name}]", *toml_lines({"sha256": entry.sha256})]
@@ -77,9 +77,9 @@ def save_tokens(folder: Path, tokens: Tokens) -> None:
 
 
 class TokenFile:
-    """Tokens of a folder as they are now: the file is read again when it changes, so a revoked one counts no more.
+    """Current tokens of a folder: the file is reread on change, so revocations take effect.
 
-    ConfigError where there is no file that can be read. One that is damaged later lets nobody in, and is logged.
+    ConfigError without a readable file. If damaged later, it admits nobody, and is logged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -91,7 +91,7 @@ class TokenFile:
         self._tokens = load_tokens(folder)
 
     def person(self, token: str) -> str | None:
-        """Whose token this is; None where it is nobody's."""
+        """A token's person, or None."""
         path = self._folder / TOKENS_FILE
         status = path.stat() if path.is_file() else None
         stamp = (status.st_mtime_ns, status.st_ino) if status else None

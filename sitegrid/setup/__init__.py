@@ -1,1 +1,1 @@
-"""What a user sets up on one laptop: what talks on its ports, and a folder with the files of a site and a machine."""
+"""Set-up on one laptop: what is on the ports, and a folder of site and machine files."""

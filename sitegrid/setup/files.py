@@ -1,6 +1,6 @@
-"""The files of a set-up: `site.toml` and `agent.toml` for what was heard on the ports, each key with how to measure it.
+"""Set-up files `site.toml` and `agent.toml` for what was heard, with measuring instructions per key.
 
-They have only what a user must say. Before they are written, the readers of server and agent have read them.
+They hold only what a user must state, and are parsed as by server and agent before writing.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from protocol.site.site_file import load_site
 from protocol.wire.session import DEFAULT_ENDPOINT
 from sitegrid.setup.hearing import HeardLine
 
-PORTS = ROUTER, PAGE = int(DEFAULT_ENDPOINT.rpartition(":")[2]), 8080  # where router and page usually listen
+PORTS = ROUTER, PAGE = int(DEFAULT_ENDPOINT.rpartition(":")[2]), 8080  # usual ports of router and page
 MODELS = Path(__file__).with_name("models.toml")
 ORIGIN = ("origin_lat_deg", "origin_lon_deg", "origin_height_m")
-PLACES = (6, 6, 1)  # decimals of an origin: a tenth of a metre; what it is matters less than that all have the same
-NAMES = {FIX: "gps", VELOCITY: "doppler", HEADING: "compass", IMU: "imu", WHEELS: "wheels"}  # of sensors
-# How to measure what a user must say.
+PLACES = (6, 6, 1)  # decimals of an origin: 0.1 m; its sameness matters more than its accuracy
+NAMES = {FIX: "gps", VELOCITY: "doppler", HEADING: "compass", IMU: "imu", WHEELS: "wheels"}  # sensor names
+# Measuring instructions for user-supplied values.
 HOW = {
     "mass_kg": "empty, with driver and fuel: by a weighbridge, or its plate; only torque needs it",
     "wheel_radius_m": "by tape from the ground to the middle of a driven wheel, or of a track's sprocket",
@@ -47,7 +47,7 @@ HOW = {
 
 
 class Folder:
-    """Where a set-up has its files: the site, the machine with its receivers, what is mapped, what waits, logs."""
+    """Files of a set-up: site, machine, store, spool, logs."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.logs = path, path / "logs"
@@ -55,7 +55,7 @@ class Folder:
         self.store, self.spool = path / "store", path / "spool.db"
 
     def load(self) -> tuple[SiteConfig, MachineConfig, AgentConfig]:
-        """Read both files as server and agent do; raises ConfigError."""
+        """Read both files like server and agent; ConfigError."""
         for path in (self.site_file, self.agent_file):
             if not path.exists():
                 raise ConfigError(path, "no such file; `sitegrid init` makes it")
@@ -68,12 +68,12 @@ class Folder:
 
 @cache
 def models() -> dict[str, dict[str, Any]]:
-    """Kinds of machines, by name."""
+    """Kinds of machines by name."""
     return tomllib.loads(MODELS.read_text(encoding="utf-8"))
 
 
 def origin_of(every: Sequence[HeardLine]) -> tuple[float, ...]:
-    """The first place that a receiver states: latitude, longitude, height; empty where none does."""
+    """First place stated by a receiver: latitude, longitude, height; else empty."""
     place = next((heard.place for heard in every if heard.place), ())
     return tuple(round(value, n) for value, n in zip(place, PLACES, strict=False))
 
@@ -87,7 +87,7 @@ def site_text(name: str, origin: Sequence[float]) -> str:
 
 
 def agent_text(name: str, model: str, every: Sequence[HeardLine]) -> str:
-    """An `agent.toml` for a machine of this model with these receivers."""
+    """An `agent.toml` for a machine model with these receivers."""
     template = models()[model]
     lines = [f"# A machine, made by `sitegrid init` as a {model}: measure, and correct, what has a comment."]
     lines += ["", "[machine]", *toml_lines({"name": name}), *_explained(template["machine"])]
@@ -105,7 +105,7 @@ def agent_text(name: str, model: str, every: Sequence[HeardLine]) -> str:
 
 
 def write(folder: Folder, site: str, agent: str) -> list[Path]:
-    """Write the files that are not there, once they were read; returns them. ConfigError where one is wrong."""
+    """Validate, then write missing files; returns them. ConfigError if one is invalid."""
     folder.path.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as trial:
         tried = Folder(Path(trial))
@@ -124,7 +124,6 @@ def write(folder: Folder, site: str, agent: str) -> list[Path]:
 
 
 def _sensor_lines(stream: str, kind: str, template: Mapping[str, Any]) -> Iterator[str]:
-    """The keys of a sensor that a user must say."""
     if stream in (FIX, VELOCITY):
         how = HOW["mount"] if stream == FIX else "of the same antenna"
         yield f"mount = {{ xyz_m = {template['antenna_m']} }}  # {how}"

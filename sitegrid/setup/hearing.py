@@ -1,4 +1,4 @@
-"""What talks on a line: formats, how often each message comes, what its receiver says of place and time. Pure."""
+"""What is on a line: formats, message rates, place and time from its receiver. Pure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from agents.drivers.line import DECODERS
 from agents.drivers.receiver import why_unplaced
 
 UBX_NAMES = {(1, 7): "NAV-PVT", (1, 60): "NAV-RELPOSNED", (16, 2): "ESF-MEAS", (16, 3): "ESF-RAW"}
-# What a receiver without a fix will feed, by its messages.
+# Streams expected after a first fix, by message.
 PROMISED = {
     "NAV-PVT": (FIX, VELOCITY),
     "NAV-RELPOSNED": (HEADING,),
@@ -26,20 +26,20 @@ PROMISED = {
     "THS": (HEADING,),
     "TPV": (FIX, VELOCITY),
 }
-# Formats that no driver reads, by how their messages begin.
+# Unsupported formats, by sync bytes.
 FOREIGN = {b"$@": "SBF (Septentrio)", b"\xaaD\x12": "NovAtel's binary", b"\xa0\xa2": "SiRF's binary"}
-ENGINE = "engine"  # stream of a bus
-MANY, MOST_BETWEEN = 3, 2000  # such beginnings, and bytes from one to the next, are no chance
+ENGINE = "engine"  # a bus stream
+MANY, MOST_BETWEEN = 3, 2000  # so many sync matches, at most so many bytes apart, are no coincidence
 NO_PORT = "no serial port is there: plug a receiver in, or name an address (tcp://HOST:PORT, udp://:PORT, gpsd, a file)"
 
 
 @dataclass(frozen=True)
 class HeardLine:
-    """What came over a line.
+    """What was heard on a line.
 
-    kind: of the [[driver]] that reads it; empty where none does. messages: how often each comes [Hz]. streams: what it
-    can feed. place: latitude, longitude [deg], height [m] of the newest fix; empty without one. accuracy_m: its
-    standard deviation, None where that is not stated. utc_ns: 0 where it states no time. problem: what hinders it.
+    kind: of its [[driver]]; empty: none. messages: rates [Hz]. streams: usable ones. place: newest fix, latitude,
+    longitude [deg], height [m], or empty. accuracy_m: standard deviation, None: not stated. utc_ns: 0: no time.
+    problem: what prevents use.
     """
 
     address: str
@@ -56,7 +56,7 @@ class HeardLine:
 
 
 class Ear:
-    """Listens to the bytes of one line. n_bytes: so far; frames: whole ones."""
+    """Analyses one line's bytes. n_bytes: so far; frames: complete ones."""
 
     def __init__(self) -> None:
         self.n_bytes = self.frames = 0
@@ -70,11 +70,11 @@ class Ear:
         self._utc_ns = 0
 
     def hears(self, format_: str) -> bool:
-        """Whether frames of this format have come."""
+        """Whether frames of this format arrived."""
         return any(name.startswith(f"{format_} ") for name in self._rates)
 
     def feed(self, data: bytes, host_ns: int | None) -> None:
-        """Take in bytes, the last of which came at `host_ns` by the host's clock; None: a file's."""
+        """Take bytes; the last arrived at `host_ns`, host clock, None: from a file."""
         self.n_bytes += len(data)
         self._foreign.update({name: data.count(sync) for sync, name in FOREIGN.items()})
         for frame in self._framer.feed(data):
@@ -87,7 +87,7 @@ class Ear:
                 self._decode(frame, host_ns or self._utc_ns)
 
     def heard(self, address: str, baud: int = 0) -> HeardLine:
-        """What has been heard so far."""
+        """Result so far."""
         rates = {name: rate.hz for name, rate in sorted(self._rates.items())}
         kind = max(self._streams, key=lambda name: (len(self._streams[name]), name == UBX))
         streams = tuple(stream for stream in STREAMS if stream in self._streams[kind])
@@ -100,7 +100,7 @@ class Ear:
             problem = problem or several
         fix = self._seen or Message(FIX, "", 0)
         std_m = math.sqrt(sum(fix.values[3:5]) / 2)
-        stated_m = std_m if std_m > 0 else None  # NaN is not stated
+        stated_m = std_m if std_m > 0 else None  # NaN: not stated
         shown = (fix.values[:3], stated_m, fix.quality, fix.satellites)
         return HeardLine(address, kind, baud, rates, streams, *shown, self._utc_ns, problem)
 
@@ -133,7 +133,7 @@ class Ear:
 
 @dataclass
 class _Rate:
-    """How many messages came from the first one whose time is known to the last [s]."""
+    """Messages between the first and last with known time [s]."""
 
     n: int = 0
     first_s: float = 0.0
@@ -146,12 +146,12 @@ class _Rate:
 
     @property
     def hz(self) -> float:
-        """0 where one alone came."""
+        """0 for a single message."""
         return round((self.n - 1) / (self.last_s - self.first_s), 2) if self.last_s > self.first_s else 0.0
 
 
 def _name(frame: Frame) -> str:
-    """What a frame is, as its format calls it."""
+    """A frame's name in its format."""
     data = frame.data
     if frame.format == UBX:
         return UBX_NAMES.get((data[2], data[3]), f"{data[2]:02X}-{data[3]:02X}")
@@ -161,14 +161,14 @@ def _name(frame: Frame) -> str:
 
 
 def _sender(frame: Frame) -> str:
-    """Who sends, where several share a line."""
+    """Sender on a shared line."""
     if frame.format == NMEA:
         return frame.data[1:3].decode("ascii", "replace").lower()
     return str(json.loads(frame.data).get("device", "")) if frame.format == GPSD else ""
 
 
 def block(heard: HeardLine) -> list[str]:
-    """The address, then what comes there and what hinders it."""
+    """Address, contents and problem, as lines."""
     baud = f" at {heard.baud} baud" if heard.baud else ""
     rates = ", ".join(f"{name} {f'{hz:g} Hz' if hz else 'once'}" for name, hz in heard.messages.items())
     said = [f"{heard.kind or 'no driver reads this'}{baud}: {rates}"] if heard.messages else []
@@ -185,7 +185,7 @@ def block(heard: HeardLine) -> list[str]:
 
 
 def missing(every: Sequence[HeardLine]) -> dict[str, str]:
-    """What an agent lacks that is fed by these, a sentence for each thing that it cannot know."""
+    """What an agent on these lines cannot know, a sentence each."""
     streams = {stream for heard in every for stream in heard.streams}
     lacks = {} if FIX in streams else {"position": "no receiver: no position, so no sample"}
     if IMU not in streams:

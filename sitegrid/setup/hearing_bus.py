@@ -1,4 +1,4 @@
-"""What talks on a CAN bus: which parameter groups come with values, and what an agent misses among them."""
+"""What is on a CAN bus: parameter groups with values, and groups that an agent misses."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from protocol.machine.machine_config import SensorConfig
 from sitegrid.setup.hearing import HeardLine
 
 NEEDED = {"engine": "engine torque (EEC1)", "speed": "wheel speed (CCVS1)", "gearbox": "clutch and shifts (ETC1)"}
-PLACES = {"fix", "velocity"}  # a bus of NMEA 2000 has no engine to drive by
+PLACES = {"fix", "velocity"}  # NMEA 2000 buses have no engine
 POLL_S = 0.1
-USUAL = re.compile(r"v?can\d+")  # names of buses, which a host may lack
+USUAL = re.compile(r"v?can\d+")  # bus names that a host may lack
 
 
 def is_bus(address: str) -> bool:
-    """Whether an address is that of a bus, or of a recording of one."""
+    """Whether an address is a bus, or a recording of one."""
     if is_recording(address) or address in buses() or USUAL.fullmatch(address):
         return True
     try:
@@ -34,7 +34,7 @@ def is_bus(address: str) -> bool:
 
 
 def listen_to_bus(address: str, seconds: float) -> HeardLine:
-    """What comes on a bus within some seconds, or is in a recording."""
+    """Listen to a bus for some seconds, or read a recording."""
     try:
         if is_recording(address):
             return heard_bus(address, read_recording(address))
@@ -45,7 +45,7 @@ def listen_to_bus(address: str, seconds: float) -> HeardLine:
 
 
 def heard_bus(address: str, frames: Iterable[CanFrame]) -> HeardLine:
-    """Which groups of these frames have values, what they can feed, and what is missing."""
+    """Groups with values in these frames, usable streams, missing ones."""
     line = CanLine({name: SensorConfig(name, stream.kind) for name, stream in STREAMS.items()}, SIGNALS)
     stamps: dict[str, list[float]] = {}
     streams: set[str] = set()
@@ -70,5 +70,5 @@ def _live(bus: Bus, end_s: float) -> Iterator[CanFrame]:
 
 
 def _hz(stamps: list[float]) -> float:
-    """0 where one alone came."""
+    """0 for a single frame."""
     return round((len(stamps) - 1) / (stamps[-1] - stamps[0]), 2) if stamps[-1] > stamps[0] else 0.0

@@ -1,4 +1,4 @@
-"""Listens to ports, addresses and files for a while: opens them, and tries the usual bauds until frames come."""
+"""Listen to ports, addresses and files, trying usual baud rates until frames arrive."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOST_FILE_BYTES = 1 << 22  # of a recording: an hour of a receiver
 
 
 def address_of(text: str) -> str:
-    """An address as [[driver]] has it, `gpsd` for that of this host; ConfigError where it is none."""
+    """An address as in [[driver]]; `gpsd`: on this host. ConfigError if invalid."""
     if is_bus(text) and not is_recording(text):
         return text
     address = f"tcp://127.0.0.1:{GPSD_PORT}" if text == GPSD else text
@@ -36,7 +36,7 @@ def address_of(text: str) -> str:
 
 
 def listen_to(addresses: Sequence[str], seconds: float, bauds: Sequence[int] = BAUDS) -> list[HeardLine]:
-    """What talks at these addresses, all at once. seconds: from the first frame, or of silence."""
+    """Listen to all addresses at once. seconds: from the first frame, or of silence."""
     if not addresses:
         return []
     with ThreadPoolExecutor(len(addresses)) as pool:
@@ -44,7 +44,7 @@ def listen_to(addresses: Sequence[str], seconds: float, bauds: Sequence[int] = B
 
 
 def listen(address: str, seconds: float, bauds: Sequence[int] = BAUDS) -> HeardLine:
-    """What talks at one address; on a serial port at the first baud with frames."""
+    """Listen to one address; on serial ports at the first baud rate with frames."""
     if is_bus(address):
         return listen_to_bus(address, seconds)
     ear, is_serial = Ear(), "://" not in address
@@ -63,7 +63,7 @@ def listen(address: str, seconds: float, bauds: Sequence[int] = BAUDS) -> HeardL
 
 
 def _hear(transport: Transport, ear: Ear, seconds: float) -> str:
-    """Listen until it is time; returns why the link broke, empty if it did not."""
+    """Listen until the end; returns why the link broke, or empty."""
     end_s, is_greeted = time.monotonic() + max(seconds, TRY_S), False
     while (left_s := end_s - time.monotonic()) > 0:
         try:

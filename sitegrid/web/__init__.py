@@ -1,1 +1,1 @@
-"""The map's HTTP feed: the live page, the resources of an API, tiles and features for other tools."""
+"""The map over HTTP: live page, API resources, tiles, features."""

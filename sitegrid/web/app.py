@@ -1,4 +1,4 @@
-"""The web server as an ASGI application: paths to resources, pages, tiles, live connections."""
+"""The web server as ASGI application: routes to resources, pages, tiles, live connections."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from sitegrid.web.values import RequestProblem, bad, problem_response
 from sitegrid.web.xyz import mercator, overview
 
 PAGE = Path(__file__).parent / "page"
-FRESH_S = 1.0  # how old the version may be that a tile, or a copy that the asker has, is compared with
-PNG_BYTES = 2**25  # of tiles that are kept: some 4000
-SMALL_ALREADY = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/x-npz")  # deflated inside
-MARGIN_M = 100.0  # around the map's bounds, which are of what is folded: a tile shows samples that still wait for it
+FRESH_S = 1.0  # maximum age of the version used for tiles and cached copies
+PNG_BYTES = 2**25  # tile cache: about 4000 tiles
+SMALL_ALREADY = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/x-npz")  # already compressed
+MARGIN_M = 100.0  # around the bounds of folded samples: tiles show samples that wait for the fold
 log = logging.getLogger("sitegrid.web")
 
 
 class WebApp:
-    """All sites, and what answers for them. person, counts, names: see Guard."""
+    """All sites and their routes. person, counts, names: see Guard."""
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ class WebApp:
         return await as_json(description())
 
     async def _resource(self, request: Request) -> Response:
-        """One resource; a copy that the asker has is confirmed where the map is still that one."""
+        """One resource; 304 if the client's copy is of the current map."""
         name = request.url.path.split("/", 5)[5]
         resource, parameters = RESOURCES[name], _parameters(request)
         try:
@@ -108,7 +108,7 @@ class WebApp:
             if has_copy(request, tag):
                 return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
             response = await resource.answered(feed, parameters)
-        except Exception as error:  # whatever it was: one answer, as a problem
+        except Exception as error:  # any error becomes a problem response
             return _failed(request, error)
         own = response.headers.get("etag")
         response.headers.update(headers if own in (None, _tag(info, with_now=False)) else {**headers, "ETag": str(own)})
@@ -122,13 +122,13 @@ class WebApp:
         await live.serve(socket, self._feed(socket))
 
     async def _tilejson(self, request: Request) -> Response:
-        """TileJSON of a layer in colours, and of its values."""
+        """TileJSON of a layer, as colours or values."""
         try:
             feed, layer = self._feed(request), request.path_params["layer"]
             kind = _parameters(request).get("kind", "colour")
             info = await feed.info(FRESH_S)
             _check_layer(kind, layer, info)
-            token = request.query_params.get("token")  # who can send it in addresses alone needs it in these too
+            token = request.query_params.get("token")  # clients that only send addresses need it in these too
             end = f"?{urlencode({'token': token})}" if token else ""
             base = f"{request.url.scheme}://{request.url.netloc}{PREFIX}/sites/{feed.name}/xyz/{kind}/{layer}"
             table: dict[str, Any] = {
@@ -171,7 +171,7 @@ class WebApp:
         return Response(png, headers=headers, media_type="image/png")
 
     async def _healthz(self, _: Request) -> Response:
-        """Whether the web server answers; whether map servers do is in /metrics."""
+        """Liveness of the web server; map servers: /metrics."""
         return PlainTextResponse("ok\n")
 
     async def _metrics(self, _: Request) -> Response:
@@ -189,7 +189,7 @@ class WebApp:
 
 
 async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tuple[int, int, int]) -> bytes:
-    """An XYZ tile: the map's cells below its pixels."""
+    """An XYZ tile of the map's cells."""
     cell_m, projection = info.site.cell_m, await feed.projection()
     png = mercator.value_png if kind == "value" else mercator.colour_png
     if mercator.pixel_m(place[0], info.site.origin_lat_deg) > overview.LEAST_CELLS * cell_m:
@@ -206,7 +206,7 @@ async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tupl
 
 
 def _known(info: MapInfo) -> Bounds:
-    """Where the map may know anything: the whole site, until its blocks are counted."""
+    """Where the map may have values: the whole site until its blocks are counted."""
     if info.bounds is None:
         return Bounds(-info.site.extent_m, -info.site.extent_m, info.site.extent_m, info.site.extent_m)
     west, south, east, north = (edge * info.site.cell_m for edge in info.bounds)
@@ -236,7 +236,7 @@ def _parameters(request: Request) -> dict[str, str]:
 
 
 def _tag(info: MapInfo, *, with_now: bool) -> str:
-    """Which map an answer is of: its store and version, and the site's now where ages depend on it."""
+    """Tag of an answer's map: store and version, and the site's now if ages depend on it."""
     tag = tag_of(MapVersion(info.store, info.merged, info.fact))
     return f'{tag[:-1]}-{info.stamp_ns}-{info.journalled}"' if with_now else tag
 

@@ -1,6 +1,6 @@
-"""Answers as bytes, made beside the event loop: by a few threads, in pieces, no faster than the asker takes them.
+"""Encode answers off the event loop: few threads, in pieces, at the client's pace.
 
-Python runs one thread at a time: what makes a long text in one go stops the event loop from any thread.
+Python runs one thread at a time, so encoding a long text at once would block the loop from any thread.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from sitegrid.web.values import plain, with_times
 
 T = TypeVar("T")
 THREADS = 2  # more would only wait for each other
-PIECE = 2**16  # characters of text, made in some 2 ms
-WHOLE = 2**22  # bytes: what is shorter is sent with its length, which some programs want (GDAL)
-AT_ONCE = 2000  # numbers, made into text in 1 ms
-LARGE_S = 300.0  # for a large answer to be taken: 64 MB at 2 Mbit/s
+PIECE = 2**16  # characters, encoded in 2 ms
+WHOLE = 2**22  # bytes: shorter answers have a length, which some programs need (GDAL)
+AT_ONCE = 2000  # numbers, formatted in 1 ms
+LARGE_S = 300.0  # timeout of a large answer: 64 MB at 2 Mbit/s
 _pool = ThreadPoolExecutor(THREADS, thread_name_prefix="encode")
 
 
@@ -39,17 +39,17 @@ def _nothing() -> None:
 
 
 async def beside(work: Callable[..., T], *arguments: Any) -> T:
-    """Do what takes processor time on one of a few threads."""
+    """Run CPU work on one of a few threads."""
     return await asyncio.get_running_loop().run_in_executor(_pool, partial(work, *arguments))
 
 
 async def as_json(value: Any, media: str = "application/json", done: Callable[[], None] = _nothing) -> Response:
-    """Records, arrays, tables, lists and iterators as JSON. done: as of `answered`."""
+    """Records, arrays, tables, lists and iterators as JSON. done: see `answered`."""
     return await answered(pieces(value), media, done)
 
 
 async def answered(parts: Iterator[bytes], media: str, done: Callable[[], None] = _nothing) -> Response:
-    """An answer in parts; what is long is made while it is sent. done: gives back its room, without it taken here."""
+    """An answer in parts; long ones are encoded while sent. done: releases its room; by default taken here."""
     first = await beside(_begin, parts)
     if done is _nothing:
         if len(first) <= PIECE:
@@ -62,7 +62,7 @@ async def answered(parts: Iterator[bytes], media: str, done: Callable[[], None] 
 
 
 def _begin(parts: Iterator[bytes]) -> bytes:
-    """An answer, or WHOLE of it."""
+    """The answer's first WHOLE bytes."""
     first = bytearray()
     while len(first) < WHOLE and (part := next(parts, b"")):
         first += part
@@ -75,7 +75,7 @@ async def _made(texts: Iterator[bytes]) -> AsyncIterator[bytes]:
 
 
 def pieces(value: Any) -> Iterator[bytes]:
-    """The JSON of a value as `plain` makes it, in pieces of about PIECE; at least one."""
+    """JSON of a value, as by `plain`, in pieces of about PIECE; at least one."""
     texts, size = [], 0
     for text in _texts(value):
         texts.append(text)
@@ -87,7 +87,7 @@ def pieces(value: Any) -> Iterator[bytes]:
 
 
 def _texts(value: Any) -> Iterator[str]:
-    """JSON in parts, none of which takes long to make."""
+    """JSON in parts that are quick to make."""
     if is_dataclass(value) and not isinstance(value, type):
         value = {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, Mapping):
@@ -107,7 +107,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _parts(value: Any) -> Iterator[Iterator[str]]:
-    """What stands between the brackets of a list: many numbers at once, what holds more by itself."""
+    """A list's content: many numbers at once, containers one by one."""
     if isinstance(value, Iterator) or (len(value) and not isinstance(value, np.ndarray) and _holds_more(value[0])):
         yield from map(_texts, value)
         return
@@ -122,7 +122,7 @@ def _holds_more(item: Any) -> bool:
 
 
 def frame(answer: TilesAnswer) -> bytes:
-    """Tiles for a page: length of a JSON head (4 bytes, big-endian), the head, the deflated planes end to end."""
+    """Tiles for a page: length of a JSON head (4 bytes, big-endian), head, deflated planes."""
     head = {
         "store": answer.version.store,
         "row": answer.version.row,
@@ -144,13 +144,13 @@ def _head(tile: MapTile) -> dict[str, Any]:
 
 
 class Room:
-    """Room for what large answers hold until they are sent, in the unit that callers choose."""
+    """Bounded room for large answers in flight, in the caller's unit."""
 
     def __init__(self, most: int) -> None:
         self._free = most
 
     def take(self, size: int) -> Callable[[], None]:
-        """Take some of it; returns what gives it back. QueryError where there is not so much, on the loop's thread."""
+        """Take room; returns its release. QueryError if there is too little. On the loop's thread."""
         if size > self._free:
             raise QueryError(Refusal.OVERLOADED, "too many large answers are being taken; ask again later, or for less")
         self._free -= size
@@ -165,7 +165,7 @@ ROOM = Room(2**27)  # bytes, for all visitors
 
 
 class Large(StreamingResponse):
-    """A large answer: whoever does not take it in time gets no more of it. done: is called in the end."""
+    """A large answer, cut off for slow clients. done: called at the end."""
 
     def __init__(self, texts: Iterator[bytes], media: str, done: Callable[[], None]) -> None:
         super().__init__(_made(texts), media_type=media)
@@ -181,14 +181,14 @@ class Large(StreamingResponse):
 
 
 class Cache(OrderedDict[Any, T]):
-    """Values that are kept ready, the newest that together have at most so many bytes."""
+    """Cache of the newest values, bounded in bytes."""
 
     def __init__(self, most: int, size: Callable[[T], int]) -> None:
         super().__init__()
         self._most, self._size, self._used = most, size, 0
 
     def keep(self, key: Any, value: T) -> None:
-        """Keep a value, unless it is there."""
+        """Add a value unless present."""
         if key not in self:
             self[key] = value
             self._used += self._size(value)

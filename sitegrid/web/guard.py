@@ -1,4 +1,4 @@
-"""Who may come in, and how much: names, tokens, origins, limits and headers, before anything is worked on."""
+"""Access checks before any work: names, tokens, origins, limits, headers."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from sitegrid.web.values import RequestProblem, problem_response
 
 COOKIE = "sitegrid"
-RATE_HZ, BURST = 100.0, 500.0  # requests of one address: a GIS asks for some hundred tiles when its view moves
-ADDRESSES = 4096  # whose rate is known; the one that was silent longest is forgotten first
-MAX_PATH, MAX_QUERY = 1024, 32_768  # bytes of a path, and of parameters: a polygon of 1000 corners
-OPEN_PATHS = ("/healthz",)  # says nothing of a site; who watches a server asks without a token, by any name
-_HOST = re.compile(r"(\[[^][]*\]|[^][:@/?#]*)(:\d*)?")  # a Host header: a name or address, and a port
+RATE_HZ, BURST = 100.0, 500.0  # requests per address: a GIS asks for hundreds of tiles per move
+ADDRESSES = 4096  # known rates; the longest silent address is forgotten first
+MAX_PATH, MAX_QUERY = 1024, 32_768  # bytes of path and parameters: a polygon of 1000 corners
+OPEN_PATHS = ("/healthz",)  # reveal nothing of a site; monitoring has no token, and uses any name
+_HOST = re.compile(r"(\[[^][]*\]|[^][:@/?#]*)(:\d*)?")  # Host header: name or address, and port
 HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data: blob:; "
@@ -36,9 +36,9 @@ HEADERS = {
 
 
 class Guard:
-    """Middleware. person: whose token it is, None for nobody's; without it everybody may come in.
+    """Middleware. person: a token's person or None; without it everybody is admitted.
 
-    counts: of what came in and what was refused, sockets among it. names: of this server, in lower case.
+    counts: requests and refusals, of sockets too. names: of this server, lower case.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Guard:
         self.counts = counts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request or connection, or refuse it."""
+        """Serve or refuse one request or connection."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -90,7 +90,7 @@ class Guard:
             raise RequestProblem(HTTPStatus.UNAUTHORIZED, "no_permission", detail, {"WWW-Authenticate": "Bearer"})
 
     def _check_host(self, headers: Headers) -> None:
-        """Refuse pages of others, and a page whose own name was made to lead here (DNS rebinding)."""
+        """Refuse foreign pages and DNS rebinding."""
         host = headers.get("host", "")
         parts = _HOST.fullmatch(host)
         name = parts[1].lower().rstrip(".") if parts else host
@@ -101,7 +101,7 @@ class Guard:
             raise RequestProblem(HTTPStatus.FORBIDDEN, "wrong_origin", "a page of another address may not ask here")
 
     def _count_rate(self, scope: Scope) -> None:
-        """A bucket of BURST that fills with RATE_HZ."""
+        """Token bucket of BURST, refilled at RATE_HZ."""
         address = scope["client"][0] if scope.get("client") else ""
         now_s = time.monotonic()
         level, seen_s = self._rates.pop(address, (BURST, now_s))
@@ -115,7 +115,7 @@ class Guard:
             )
 
     def _without_token(self, scope: Scope) -> RedirectResponse | None:
-        """A page that was opened with its token goes on with a cookie, so that the token stays in no history."""
+        """Exchange a page's token for a cookie, so that it stays out of histories."""
         parameters = parse_qsl(scope["query_string"].decode("latin-1"))
         token = dict(parameters).get("token")
         if not self._person or not token or scope["path"] != "/":
@@ -136,7 +136,7 @@ class Guard:
 
 
 def _check_body(headers: Headers) -> None:
-    """Refuse a body, and end its connection: another reader may see its end elsewhere, and a second request in it."""
+    """Refuse a body and close: another parser may see its end elsewhere, and a smuggled request in it."""
     if "content-length" in headers and "transfer-encoding" in headers:
         detail = "the request states its length twice (Content-Length, Transfer-Encoding); send neither"
         raise RequestProblem(HTTPStatus.BAD_REQUEST, "two_lengths", detail, {"Connection": "close"})
@@ -153,7 +153,7 @@ def _is_address(text: str) -> bool:
 
 
 def _place_of(origin: str) -> str:
-    """Host and port of an Origin; empty where it is none."""
+    """Host and port of an Origin, empty if invalid."""
     try:
         return urlsplit(origin).netloc
     except ValueError:
@@ -165,7 +165,7 @@ def _always() -> bool:
 
 
 def _token(scope: Scope, headers: Headers) -> str:
-    """The token of a request: in its header, its cookie, or its address, for tools that know addresses alone."""
+    """A request's token: header, cookie, or address for tools that have nothing else."""
     kind, _, token = headers.get("authorization", "").partition(" ")
     if kind.lower() == "bearer" and token:
         return token.strip()

@@ -1,7 +1,7 @@
-"""The live connection of a page: the map as it was when the page last had time for it, never a queue.
+"""Live connection of a page: always the current map, never a queue.
 
-A page says which version it has. It gets what differs from that, says that it has taken it in, and only then gets the
-next: a slow page gets newer maps less often, and costs no memory.
+A page states its version and gets the difference. The next follows once it is acknowledged, so slow pages get newer
+maps less often, at no memory cost.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from protocol.queries.answers import MapVersion
 from sitegrid.web.encoding import beside, frame
 from sitegrid.web.site import POSES_S, SiteFeed
 
-TAKEN_S = 30.0  # a page that has not taken a map in for so long is disconnected; it comes back by itself
-QUIET_S = 1.0  # poses are sent at least so often
+TAKEN_S = 30.0  # a page that acknowledges nothing for this long is disconnected; it reconnects
+QUIET_S = 1.0  # longest interval between poses
 NO_PERMISSION, TOO_SLOW = 4401, 4408
 AWAY = json.dumps({"state": "away"})
 
 
 async def serve(socket: WebSocket, feed: SiteFeed) -> None:
-    """Serve one page until it goes, or takes nothing any more."""
+    """Serve one page until it leaves or stalls."""
     await socket.accept()
     page = _Page(socket, feed, _version(socket.query_params))
     async with feed.watched():
@@ -39,19 +39,19 @@ async def serve(socket: WebSocket, feed: SiteFeed) -> None:
 
 
 class _Page:
-    """One page. version: the map that it has taken in."""
+    """One page. version: the map it acknowledged."""
 
     def __init__(self, socket: WebSocket, feed: SiteFeed, version: MapVersion | None) -> None:
         self._socket, self._door, self._version = socket, feed, version
         self._may_stay: Callable[[], bool] = socket.scope.get("may_stay", lambda: True)  # see Guard
-        self._sent: MapVersion | None = None  # on its way
+        self._sent: MapVersion | None = None  # in flight
         self._sent_s = 0.0
         self._taken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._state = ""
         self._poses_s = -QUIET_S
 
     async def receive(self) -> None:
-        """Take what the page says: the version that it has taken in."""
+        """Receive acknowledged versions."""
         while True:
             try:
                 table = json.loads(await self._socket.receive_text())  # KeyError for bytes
@@ -64,7 +64,7 @@ class _Page:
                 self._taken.set_result(None)
 
     async def send(self) -> None:
-        """Send what is new, whenever there is anything."""
+        """Send news as it arises."""
         feed, loop = self._door, asyncio.get_running_loop()
         while True:
             now_s = loop.time()
@@ -74,7 +74,7 @@ class _Page:
             if not self._may_stay():
                 await self._socket.close(NO_PERMISSION, "the token no longer counts")
                 return
-            moved, self._taken = feed.moved, loop.create_future()  # before: what comes meanwhile is news too
+            moved, self._taken = feed.moved, loop.create_future()  # before sending, so that no news is missed
             await self._send_news(now_s)
             await asyncio.wait([moved, self._taken], timeout=QUIET_S, return_when=asyncio.FIRST_COMPLETED)
 
@@ -89,13 +89,13 @@ class _Page:
                 self._sent, self._sent_s = answer.version, now_s
                 await self._timely(socket.send_bytes(await beside(frame, answer)))
             else:
-                self._version = answer.version  # nothing that the page shows is another one
+                self._version = answer.version  # nothing on the page differs
         if now_s - self._poses_s >= 0.9 * POSES_S and (poses := feed.poses_text()):
             self._poses_s = now_s
             await self._timely(socket.send_text(poses))
 
     async def _timely(self, sending: Any) -> None:
-        """Send; a page whose link takes nothing for long is given up."""
+        """Send, or give up on a stalled page."""
         try:
             await asyncio.wait_for(sending, TAKEN_S)
         except TimeoutError:
@@ -103,7 +103,7 @@ class _Page:
 
 
 def _version(parameters: Any) -> MapVersion | None:
-    """The version that a page has from an earlier connection; None where it has none."""
+    """The version from an earlier connection, or None."""
     try:
         return MapVersion(str(parameters["store"]), int(parameters["row"]), int(parameters["fact"]))
     except (KeyError, ValueError):

@@ -1,4 +1,4 @@
-"""Machines as pages see them: where each is, where it was, what it says of itself. Any thread may ask."""
+"""Machines for pages: pose, track, status. Thread-safe."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from protocol.wire.messages import Health, Pose
 from sitegrid.health import problems_of, report_of
 from sitegrid.web.values import plain
 
-MOST_POSES, TRACK_STEP_NS = 600, 10**9  # of a track: ten minutes of site time
-MOST_IN_ALL = 100 * MOST_POSES  # where there are more machines, tracks are shorter
-SILENT_S = 120.0  # a machine that said nothing for so long is left out
+MOST_POSES, TRACK_STEP_NS = 600, 10**9  # per track: ten minutes of site time
+MOST_IN_ALL = 100 * MOST_POSES  # beyond it tracks get shorter
+SILENT_S = 120.0  # machines silent for longer are omitted
 
 
 @dataclass
 class _Machine:
     pose: Pose | None = None
-    pose_s: float = 0.0  # when it came in
+    pose_s: float = 0.0  # time of arrival
     track: deque[Pose] = field(default_factory=deque)
     health: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Machines:
-    """The machines of a site that said anything lately, at most MOST_NAMES of them. heard: how many poses."""
+    """A site's recently heard machines, at most MOST_NAMES. heard: number of poses."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._lock = clock, threading.Lock()
@@ -42,7 +42,7 @@ class Machines:
         return len(self._heard)
 
     def on_pose(self, pose: Pose) -> None:
-        """Take a pose; MessageError where there are too many machines for another one."""
+        """Take a pose; MessageError if there are too many machines."""
         with self._lock:
             known = self._heard.get(pose.machine)
             machine = self._hear(pose.machine)
@@ -56,17 +56,17 @@ class Machines:
                     each.track.popleft()
 
     def on_health(self, health: Health) -> None:
-        """Take what a machine says of itself; MessageError as of a pose."""
+        """Take a machine's health; MessageError as for a pose."""
         with self._lock:
             self._hear(health.machine).health = health.values
 
     def on_findings(self, findings: Mapping[str, str]) -> None:
-        """Take what the map server says of machines, a sentence each."""
+        """Take the map server's findings, a sentence each."""
         with self._lock:
             self._findings = findings
 
     def poses(self) -> list[dict[str, Any]]:
-        """Newest pose of each machine that said anything lately, how old it is, and what has to be mended."""
+        """Newest pose of each recent machine, its age, and faults."""
         with self._lock:
             now_s = self._clock()
             known = [(m.pose, now_s - m.pose_s, self._faults(name, m)) for name, m, _ in self._heard.items() if m.pose]
@@ -77,7 +77,7 @@ class Machines:
         ]
 
     def reports(self) -> list[dict[str, Any]]:
-        """What each machine that spoke lately says of itself, by name."""
+        """Status of each recent machine, by name."""
         with self._lock:
             now_s = self._clock()
             known = [
@@ -93,7 +93,7 @@ class Machines:
         return sorted(map(plain, known), key=itemgetter("machine"))
 
     def tracks(self) -> dict[str, list[Pose]]:
-        """Where each machine was, oldest first."""
+        """Track of each machine, oldest first."""
         with self._lock:
             return {name: list(machine.track) for name, machine, _ in self._heard.items() if machine.track}
 

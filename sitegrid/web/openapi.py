@@ -1,4 +1,4 @@
-"""The API's description (OpenAPI 3.1), made from the table of resources."""
+"""The API's description (OpenAPI 3.1), from the table of resources."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sitegrid.web.resource import Resource
 from sitegrid.web.resources import RESOURCES
 
 PREFIX = "/api/v1"
-JSON = {ValueForm.NUMBER: "number"}  # types of parameters, where they are not text
+JSON = {ValueForm.NUMBER: "number"}  # types of non-text parameters
 PROBLEM = {
     "description": "Refused, or not possible now",
     "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
@@ -36,7 +36,7 @@ PROBLEM_SCHEMA = {
 
 
 def description() -> dict[str, Any]:
-    """All of it."""
+    """The whole description."""
     paths = {f"{PREFIX}/sites/{{site}}/{name}": {"get": _operation(name, one)} for name, one in RESOURCES.items()}
     sites = {
         "summary": "Sites that are served here",

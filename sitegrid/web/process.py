@@ -1,4 +1,4 @@
-"""The web server's process: TLS, event loop, and how long a request may keep others waiting."""
+"""The web server's process: TLS, event loop, request timeouts."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from sitegrid.web.site import SiteFeed
 from sitegrid.web.sockets import AT_ONCE, OF_ADDRESS, Listening, listen
 from sitegrid.web.values import RequestProblem, problem_response
 
-MESSAGE_BYTES = 4096  # of what a page says
-ADDRESS_BYTES = 2**18  # that are read, to be refused by name: a line of 10,000 places; beyond, the connection ends
-ROUTER_S = 1.0  # between two attempts to reach a router
-REQUEST_S = 10.0  # for a request to come in whole, from its first byte or the connection's begin
-TLS_S = 5.0  # for a handshake
-TLS_BYTES = 2**15  # that each connection keeps to receive in: a record of TLS has half of it
+MESSAGE_BYTES = 4096  # of a page's message
+ADDRESS_BYTES = 2**18  # of an address that is refused by name: a line of 10,000 places; longer ones end the connection
+ROUTER_S = 1.0  # between attempts to reach a router
+REQUEST_S = 10.0  # timeout of a request, from its first byte or the connection's start
+TLS_S = 5.0  # timeout of a handshake
+TLS_BYTES = 2**15  # receive buffer per connection; a TLS record has half of it
 
 log = logging.getLogger("sitegrid.web.process")
 
@@ -46,7 +46,7 @@ def serve(
     arguments: Namespace,
     stop: threading.Event,
 ) -> int:
-    """Serve sites, each a name (see `connect` for None) and an endpoint, until `stop` is set."""
+    """Serve sites, each a name (None: see `connect`) and an endpoint, until `stop` is set."""
     listening = opened.enter_context(listen(address))
     person = TokenFile(arguments.tokens).person if arguments.tokens else None
     secured = _tls(arguments.tls)
@@ -60,20 +60,20 @@ def serve(
     logging.getLogger("uvicorn.error").addFilter(_without_traceback)
 
     async def run() -> None:
-        if arguments.tls:  # uvicorn cannot be told how long a handshake may take, nor how much it may keep
+        if arguments.tls:  # uvicorn has no options for handshake timeout and buffer
             sslproto.SSLProtocol.max_size = TLS_BYTES
             loop: Any = asyncio.get_running_loop()
             loop.create_server = partial(loop.create_server, ssl_handshake_timeout=TLS_S, ssl_shutdown_timeout=TLS_S)
         web = WebApp([SiteFeed(client) for client in clients], person, listening.counts, names)
         config = uvicorn.Config(
             web.app,
-            http=partial(PatientProtocol, listening),  # type: ignore[arg-type] # what makes protocols
+            http=partial(PatientProtocol, listening),  # type: ignore[arg-type] # a factory
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
             h11_max_incomplete_event_size=ADDRESS_BYTES,
             backlog=AT_ONCE,
             log_config=None,
-            log_level="error",  # a line for each bad request would fill disks
+            log_level="error",  # a line per bad request would fill disks
             access_log=False,
             server_header=False,
             timeout_graceful_shutdown=1,
@@ -93,7 +93,7 @@ def serve(
 
 
 def _connected(endpoint: str, name: str | None, keys: Path | None, stop: threading.Event) -> Client | None:
-    """A client of a site, as soon as its router is there; None where `stop` is set before."""
+    """A site's client once its router is there; None if `stop` is set first."""
     problem = ""
     while not stop.is_set():
         try:
@@ -107,7 +107,7 @@ def _connected(endpoint: str, name: str | None, keys: Path | None, stop: threadi
 
 
 def _without_traceback(record: logging.LogRecord) -> bool:
-    """Of a visitor's message that is no text, which uvicorn takes for an error of its own."""
+    """Uvicorn logs a visitor's invalid text like an error of its own."""
     if record.msg == "Invalid UTF-8 sequence received from client.":
         record.exc_info = None
     return True
@@ -130,7 +130,7 @@ def _tls(folder: Path | None) -> dict[str, Any]:
 
 
 class PatientProtocol(H11Protocol):
-    """HTTP/1.1 with an end to patience: a connection whose next request does not come in whole in time is closed."""
+    """HTTP/1.1 with a timeout for every request."""
 
     def __init__(self, listening: Listening, **given: Any) -> None:
         super().__init__(**given)
@@ -138,7 +138,7 @@ class PatientProtocol(H11Protocol):
         self._deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
-        """Begin a connection, and the time that its first request has."""
+        """Start a connection and its first timeout."""
         super().connection_made(transport)
         self._connection = self._listening.connection(transport.get_extra_info("socket").fileno())
         if not self._connection.has_place:
@@ -152,7 +152,7 @@ class PatientProtocol(H11Protocol):
         self.app = problem_response(RequestProblem(HTTPStatus.TOO_MANY_REQUESTS, "too_many", detail, close))
 
     def data_received(self, data: bytes) -> None:
-        """Go on with a request, or begin one, and the time that it has."""
+        """Continue or start a request and its timeout."""
         super().data_received(data)
         if self.conn.their_state in (h11.IDLE, h11.SEND_BODY):
             self._wait()
@@ -164,23 +164,23 @@ class PatientProtocol(H11Protocol):
             self._deadline = None
 
     def on_response_complete(self) -> None:
-        """Send what is left of an answer."""
+        """Flush an answer."""
         self._cork(0)
         self._listening.waits(self._connection, now=True)
         super().on_response_complete()
 
     def pause_writing(self) -> None:
-        """Wait until the peer takes more of an answer."""
+        """Note that the peer is slow."""
         self._listening.waits(self._connection, now=True)
         super().pause_writing()
 
     def resume_writing(self) -> None:
-        """Go on with an answer."""
+        """Resume an answer."""
         self._listening.waits(self._connection, now=False)
         super().resume_writing()
 
     def _cork(self, on: int) -> None:
-        """Have head and body of an answer leave together, where the system can: a small one comes in one piece."""
+        """Send head and body together where supported: small answers come in one piece."""
         with suppress(AttributeError, OSError):
             self.transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_CORK, on)
 
@@ -193,13 +193,13 @@ class PatientProtocol(H11Protocol):
             self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The end of a connection."""
+        """End a connection."""
         if self._deadline:
             self._deadline.cancel()
         super().connection_lost(exc)
 
     def _should_upgrade(self) -> bool:
-        """WebSockets are connections too; what is not upgraded is told that there are too many."""
+        """Limit WebSockets; others get a refusal."""
         if not super()._should_upgrade():
             return False
         self._connection.is_live = self._listening.has_room_for_live(self._connection)

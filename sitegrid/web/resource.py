@@ -1,4 +1,4 @@
-"""What a resource of the API is, what parameters several of them have in common, and how answers become JSON."""
+"""API resources, their common parameters, and JSON answers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sitegrid.web.values import Parameters
 Answer = Callable[[SiteFeed, Any, Parameters], Awaitable[Response]]
 LAT_LON = (
     Parameter("lat", "latitude [deg], with lon in place of x and y", number(-90.0, 90.0)),
-    Parameter("lon", "longitude [deg]", number(-360.0, 360.0)),  # some programs count on beyond 180
+    Parameter("lon", "longitude [deg]", number(-360.0, 360.0)),  # some programs count beyond 180
 )
 FEATURE_FORMAT = Parameter("format", "geojson, or fgb: FlatGeobuf", name_of())
 FEATURE_MEDIA = {"geojson": "application/geo+json", "fgb": "application/flatgeobuf"}
@@ -33,11 +33,10 @@ FEATURE_MEDIA = {"geojson": "application/geo+json", "fgb": "application/flatgeob
 
 @dataclass(frozen=True)
 class Resource:
-    """What a path answers: a query of the map server, or what the web server itself knows.
+    """A path's answer: from a query to the map server, or from the web server.
 
-    query: what it asks, with all of its parameters but `without`, and but those of what it waits for. more: further
-    parameters, which `answer` gets as they are. media: what it may answer with. follows_now: whether it changes with
-    the site's now, not with the map alone.
+    query: its parameters apply, except `without` and those for waiting. more: further parameters, passed to `answer`.
+    media: possible types. follows_now: depends on the site's now, not on the map alone.
     """
 
     answer: Answer
@@ -50,7 +49,7 @@ class Resource:
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """All that it takes, by name."""
+        """All parameters by name."""
         known = parameters_of(self.query) if self.query else {}
         waits = parameters_of(Fresh) if self.query and issubclass(self.query, Fresh) else {}
         taken = {name: one for name, one in known.items() if name not in self.without and name not in waits}
@@ -58,7 +57,7 @@ class Resource:
         return taken | {one.name: one for one in (*places, *self.more)}
 
     async def answered(self, feed: SiteFeed, parameters: Parameters) -> Response:
-        """The answer to parameters that are known; QueryError or Problem says what is wrong with them."""
+        """Answer known parameters; QueryError or Problem names a wrong one."""
         more = {one.name for one in self.more}
         rest = {name: text for name, text in parameters.items() if name in more}
         if self.query is None:
@@ -70,7 +69,7 @@ class Resource:
 
 
 async def _in_metres(feed: SiteFeed, asked: dict[str, str]) -> dict[str, str]:
-    """Parameters with a place in `map` [m] for one in latitude and longitude."""
+    """Replace latitude and longitude by a place in `map` [m]."""
     if not {"lat", "lon"} & set(asked):
         return asked
     degrees = [one.read(asked) for one in LAT_LON]
@@ -84,7 +83,7 @@ async def _in_metres(feed: SiteFeed, asked: dict[str, str]) -> dict[str, str]:
 
 
 def _parsed(query: type[MapQuery[Any]], parameters: Parameters) -> MapQuery[Any]:
-    """A query, checked as the map server does; times may be ISO 8601, places x,y;x,y;... too."""
+    """A query, checked as by the map server; also takes ISO 8601 times and places x,y;x,y;..."""
     texts = dict(parameters)
     for name, one in parameters_of(query).items():
         if name in texts and one.kind.form is ValueForm.STAMP:
@@ -107,7 +106,7 @@ def of_features(
 
 
 async def as_features(feed: SiteFeed, more: Parameters, name: str, collection: Collection) -> Response:
-    """Features in the format that was asked for. name: of their layer."""
+    """Features in the requested format. name: of their layer."""
     kind = more.get(FEATURE_FORMAT.name, "geojson")
     if kind not in FEATURE_MEDIA:
         raise values.bad(Refusal.OUT_OF_RANGE, f"parameter `{FEATURE_FORMAT.name}`: {FEATURE_FORMAT.help}")
@@ -118,22 +117,22 @@ async def as_features(feed: SiteFeed, more: Parameters, name: str, collection: C
 
 
 def of_version(response: Response, version: MapVersion) -> Response:
-    """Name the map that an answer is of: roads may be of some seconds ago, and a copy of them is none of the newest."""
+    """Tag an answer with its map: roads may lag by seconds, so a copy may not be current."""
     response.headers["ETag"] = tag_of(version)
     return response
 
 
 def tag_of(version: MapVersion) -> str:
-    """ETag of what follows from the map alone."""
+    """ETag of answers that depend on the map alone."""
     return f'"{version.store}-{version.row}-{version.fact}"'
 
 
 def has_copy(request: Request, tag: str) -> bool:
-    """Whether the asker has what this tag names: If-None-Match takes lists and *, and weak tags (RFC 9110 13.1.2)."""
+    """Whether the client has this tag: If-None-Match takes lists, * and weak tags (RFC 9110 13.1.2)."""
     text = ",".join(request.headers.getlist("if-none-match")).strip()
     return text == "*" or tag in [part.strip().removeprefix("W/") for part in text.split(",")]
 
 
 def version_of(version: MapVersion) -> dict[str, Any]:
-    """The map that an answer is of, as all answers name it."""
+    """An answer's map version, named as everywhere."""
     return {"store": version.store, "merged": version.row, "fact": version.fact}

@@ -1,4 +1,4 @@
-"""Resources of a site: what each answers, from which parameters. A new one: a function and a line in RESOURCES."""
+"""A site's resources. A new one: a function and a line in RESOURCES."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from sitegrid.web.resource import Resource, as_features, of_features, of_version
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters, bad
 
-MAX_CELLS = {"json": 250_000, "npz": 4_000_000}  # of a region; 2 MB of text a layer
-MAX_VALUES = 16_000_000  # of a region, cells times layers: 64 MB
-AGES = ("age_s", "changed_s")  # layers that change with the site's now
+MAX_CELLS = {"json": 250_000, "npz": 4_000_000}  # of a region; 2 MB of text per layer
+MAX_VALUES = 16_000_000  # cells times layers: 64 MB
+AGES = ("age_s", "changed_s")  # layers that depend on the site's now
 
 
 async def point(feed: SiteFeed, query: PointQuery, _: Parameters) -> Response:
@@ -52,7 +52,7 @@ async def point(feed: SiteFeed, query: PointQuery, _: Parameters) -> Response:
 
 
 async def points(feed: SiteFeed, query: PointsQuery, _: Parameters) -> Response:
-    """Layers of the cells at many positions, in their order."""
+    """Layers of the cells at many positions, in order."""
     answer = await feed.answer_to(query)
     columns = {"x_m": answer.x_m, "y_m": answer.y_m, "layers": answer.layers}
     table = {**columns, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
@@ -60,7 +60,7 @@ async def points(feed: SiteFeed, query: PointsQuery, _: Parameters) -> Response:
 
 
 async def region(feed: SiteFeed, query: RegionQuery, more: Parameters) -> Response:
-    """Layers of the cells that a rectangle touches, or that lie in a polygon; or of larger cells."""
+    """Layers of cells touched by a rectangle or inside a polygon, optionally coarser."""
     kind = more.get("format", "json")
     if kind not in MAX_CELLS:
         raise bad(Refusal.OUT_OF_RANGE, "parameter `format`: json or npz")
@@ -89,7 +89,7 @@ def _table(answer: Region) -> dict[str, Any]:
 
 
 def _archive(answer: Region) -> Iterator[bytes]:
-    """An NPZ file, in pieces."""
+    """NPZ in pieces."""
     file, version = io.BytesIO(), np.array([answer.version.row, answer.version.fact])
     np.savez_compressed(file, x_m=answer.x_m, y_m=answer.y_m, version=version, **answer.layers)  # type: ignore[arg-type]
     file.seek(0)
@@ -97,70 +97,70 @@ def _archive(answer: Region) -> Iterator[bytes]:
 
 
 async def history(feed: SiteFeed, query: HistoryQuery, _: Parameters) -> Response:
-    """Layers of the cell at a position, span by span."""
+    """Layers of a cell by time span."""
     return await as_json({"spans": (await feed.answer_to(query)).spans})
 
 
 async def info(feed: SiteFeed, _: InfoQuery, __: Parameters) -> Response:
-    """State of the map and of its server, as it is."""
+    """Current state of map and server."""
     return await as_json(await feed.info(0.0))
 
 
 async def machines(feed: SiteFeed, query: MachinesQuery, _: Parameters) -> Response:
-    """What the map server knows of each machine."""
+    """The map server's view of each machine."""
     return await as_json({"machines": (await feed.answer_to(query)).machines})
 
 
 async def agents(feed: SiteFeed, _: None, __: Parameters) -> Response:
-    """What machines say of themselves: those that said so while somebody looks."""
+    """Machines' own status, heard while somebody looks."""
     async with feed.watched():
         await feed.heard()
         return await as_json({"agents": feed.reports()})
 
 
 async def changes(feed: SiteFeed, query: ChangesQuery, _: Parameters) -> Response:
-    """Changes of the ground."""
+    """Ground changes."""
     return await as_json({"changes": (await feed.answer_to(query)).changes})
 
 
 async def as_it_is(feed: SiteFeed, query: MapQuery[Any], _: Parameters) -> Response:
-    """An answer that is a record, of a version of the map."""
+    """An answer as a record of a map version."""
     answer = await feed.answer_to(query)
     return of_version(await as_json(answer), MapVersion(answer.store, answer.merged, answer.fact))
 
 
 async def lanes(feed: SiteFeed, query: LanesQuery, _: Parameters) -> Response:
-    """Cells that machines drive through, as columns: where, the heading that most have there, and metres driven so."""
+    """Driven cells as columns: place, prevailing heading, metres driven so."""
     answer = await feed.answer_to(query)
     return of_version(await as_json({**strokes(answer), "stamp_ns": answer.stamp_ns}), answer.version)
 
 
 async def tiles(feed: SiteFeed, query: TilesQuery, _: Parameters) -> Response:
-    """The map in tiles of 8-bit layers, as the live page reads it: all, those since a version, or as of a time."""
+    """Map tiles of 8-bit layers, as for the live page: all, since a version, or as of a time."""
     answer = await (feed.answer_to(query) if query.as_of_ns is None else feed.tiles_as_of(query.as_of_ns))
     return Response(await beside(frame, answer), media_type="application/octet-stream")
 
 
 async def zone_features(feed: SiteFeed, query: TilesQuery, more: Parameters) -> Response:
-    """Areas of one kind of ground, as features."""
+    """Ground areas by class, as features."""
     boundaries = (await feed.info()).boundaries
     return await as_features(feed, more, "zones", zones(await feed.answer_to(query), boundaries))
 
 
 async def change_features(feed: SiteFeed, query: ChangesQuery, more: Parameters) -> Response:
-    """Changes of the ground, as features."""
+    """Ground changes as features."""
     return await as_features(feed, more, "changes", Collection(CHANGE, (await feed.answer_to(query)).changes))
 
 
 async def machine_features(feed: SiteFeed, _: None, more: Parameters) -> Response:
-    """Where machines are, as features: those that said so while somebody looks."""
+    """Machine positions, heard while somebody looks, as features."""
     async with feed.watched():
         await feed.heard()
         return await as_features(feed, more, "machines", Collection(MACHINE, feed.poses()))
 
 
 async def track_features(feed: SiteFeed, _: None, more: Parameters) -> Response:
-    """Where machines drove while somebody looked, as features."""
+    """Tracks, heard while somebody looks, as features."""
     async with feed.watched():
         await feed.heard()
         return await as_features(feed, more, "tracks", tracks(feed.tracks()))
@@ -173,19 +173,19 @@ async def segment_features(feed: SiteFeed, query: SegmentsQuery, more: Parameter
 
 
 async def worklist_features(feed: SiteFeed, query: WorklistQuery, more: Parameters) -> Response:
-    """Stretches where work pays, as lines."""
+    """Sections worth work, as lines."""
     answer = await feed.answer_to(query)
     return _of_map(await as_features(feed, more, "worklist", Collection(WORK, answer.rows)), answer)
 
 
 async def repair_features(feed: SiteFeed, query: WorklistQuery, more: Parameters) -> Response:
-    """Stretches whose ground changed, as lines."""
+    """Sections whose ground changed, as lines."""
     answer = await feed.answer_to(query)
     return _of_map(await as_features(feed, more, "repairs", Collection(REPAIR, answer.changes)), answer)
 
 
 async def drive(feed: SiteFeed, query: LineQuery, _: Parameters) -> Response:
-    """What a drive costs a machine, along a line that is given or that costs least."""
+    """Cost of a drive along a given or cheapest line."""
     answer = await feed.answer_to(query)
     totals = {**asdict(answer.totals), "litres": answer.totals.litres}
     ground = {"line": answer.line_m, "totals": totals, "steps": vars(answer.steps), "machine": asdict(answer.machine)}
@@ -224,7 +224,7 @@ RESOURCES: dict[str, Resource] = {
     "features/machines": of_features(machine_features, "Positions of machines"),
     "features/tracks": of_features(track_features, "Lines that machines drove"),
 }
-# Other queries are answered with the fields of their records.
+# Other queries answer with their records' fields.
 RESOURCES |= {
     name: Resource(as_it_is, query.help, query, follows_now=True)
     for name, query in QUERIES.items()
@@ -233,7 +233,7 @@ RESOURCES |= {
 
 
 def follows_now(resource: Resource, parameters: Parameters) -> bool:
-    """Whether an answer may be another one although the map is not."""
+    """Whether an answer may change without the map."""
     names = WORDS.read("layers", parameters.get("layers", ""))
     ages = "layers" in resource.parameters and (not names or any(name in AGES for name in names))
     return "as_of" not in parameters and (resource.follows_now or ages)

@@ -1,4 +1,4 @@
-"""One site as its pages see it: a client of its map server, and what all pages share of it."""
+"""One site for all its pages: a client of its map server, and shared state."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ from sitegrid.web.machines import Machines
 from sitegrid.web.values import plain
 
 T = TypeVar("T")
-PERIOD_S = 0.1  # between two questions for what changed, while somebody looks: what did not change costs little
-POSES_S = 0.2  # between two times that pages are told where machines are
-STATE_S = 2.0  # between two questions for machines, changes and times
-LINGER_S = 10.0  # the map is followed so much longer than somebody looks: GIS ask every few seconds
-HEARD_S = 1.5  # machines publish their poses several times a second
-THREADS = 8  # questions at once: more visitors wait for each other, not on the map server
-PATIENT_THREADS = 4  # questions at once that may take seconds: these keep no other visitor waiting
-PAST_BYTES = 2**26  # of maps of the past that are kept ready: a hundred of a usual site, so that a slider moves
+PERIOD_S = 0.1  # between queries for changes while somebody looks; unchanged maps are cheap
+POSES_S = 0.2  # between pose updates
+STATE_S = 2.0  # between queries for machines, changes and times
+LINGER_S = 10.0  # the map is followed this long after the last visit: GIS ask every few seconds
+HEARD_S = 1.5  # machines publish poses several times a second
+THREADS = 8  # concurrent queries; excess visitors wait here, not on the map server
+PATIENT_THREADS = 4  # concurrent slow queries, which delay no other visitor
+PAST_BYTES = 2**26  # cache of past maps: a hundred of a usual site, for a slider
 
 
 class SiteFeed:
-    """Asks one site's map server for all pages together. Its methods are for the event loop's thread.
+    """Queries one site's map server for all pages. Methods run on the event loop's thread.
 
-    watchers: how many look at it now. is_away: whether the map server did not answer the last time.
+    watchers: current visitors. is_away: the map server's last query failed.
     """
 
     def __init__(self, client: Client) -> None:
         self.client, self.name = client, client.site
         self.tiles: dict[tuple[int, int], MapTile] = {}
         self.answer: TilesAnswer | None = None
-        self.state_text = ""  # what pages are told; empty until the map server has answered
+        self.state_text = ""  # empty until the map server has answered
         self.is_away = False
         self._moved: asyncio.Future[None] | None = None
-        self._woken: tuple[Any, ...] = (None, False, "", 0)  # when pages were woken last, at this time
+        self._woken: tuple[Any, ...] = (None, False, "", 0)  # state and time of the last wake-up
         self._woken_s = 0.0
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=f"ask-{client.site}")
         self._patient = ThreadPoolExecutor(PATIENT_THREADS, thread_name_prefix=f"much-{client.site}")
@@ -67,7 +67,7 @@ class SiteFeed:
         self._machines = Machines()
         self._listener: Listener[Pose] | None = None
         self._health: Listener[Health] | None = None
-        self._listens_s = 0.0  # since when, of the event loop's clock
+        self._listens_s = 0.0  # since when, on the loop's clock
         self._known: tuple[frozenset[tuple[int, int]], MapVersion | None] = frozenset(), None
         self._info: tuple[float, MapInfo] | None = None
         self._projection: Projection | None = None
@@ -75,11 +75,11 @@ class SiteFeed:
         self._past: Cache[TilesAnswer] = Cache(PAST_BYTES, _tiles_bytes)
 
     async def ask(self, question: Callable[..., T], *arguments: Any, **named: Any) -> T:
-        """Ask the map server from a thread: the client waits for its answer."""
+        """Query the map server on a thread, because the client blocks."""
         return await _run(self._threads, question, *arguments, **named)
 
     async def ask_for_much(self, question: Callable[..., T], *arguments: Any, **named: Any) -> T:
-        """As `ask`, for what takes the map server long: large areas, routes, the past."""
+        """Like `ask`, for slow queries: large areas, routes, the past."""
         return await _run(self._patient, question, *arguments, **named)
 
     async def answer_to(self, query: MapQuery[T]) -> T:
@@ -88,7 +88,7 @@ class SiteFeed:
         return await (self.ask_for_much if is_long else self.ask)(self.client.ask, query)
 
     async def info(self, most_s: float = STATE_S) -> MapInfo:
-        """State of the map, at most so old."""
+        """Map state, at most most_s old."""
         now_s = time.monotonic()
         if self._info is None or now_s - self._info[0] > most_s:
             self._info = now_s, await self.answer_to(InfoQuery())
@@ -101,26 +101,26 @@ class SiteFeed:
         return self._projection
 
     async def tiles_as_of(self, as_of_ns: int) -> TilesAnswer:
-        """The map as of a time, kept ready while no sample that is older can have come in."""
+        """The map as of a time, cached if older samples are unlikely."""
         info = await self.info()
         key = as_of_ns, info.store, info.fact
         if key in self._past:
             self._past.move_to_end(key)
             return self._past[key]
         answer = await self.answer_to(TilesQuery(as_of_ns=as_of_ns))
-        if as_of_ns < info.stamp_ns - 60 * 10**9:  # samples that are a minute late are rare, and show after a while
+        if as_of_ns < info.stamp_ns - 60 * 10**9:  # samples a minute late are rare; they show after a while
             self._past.keep(key, answer)
         return answer
 
     @property
     def moved(self) -> asyncio.Future[None]:
-        """Done when tiles, poses or the state are others: what does not change wakes no page."""
+        """Done when tiles, poses or state change."""
         if self._moved is None or self._moved.done():
             self._moved = asyncio.get_running_loop().create_future()
         return self._moved
 
     async def known_tiles(self) -> frozenset[tuple[int, int]]:
-        """Columns and rows of the map's tiles that have any ground."""
+        """Columns and rows of tiles with any ground."""
         known, version = self._known
         answer = await self.ask_for_much(self.client.ask, TilesQuery(version))
         new = frozenset((tile.x, tile.y) for tile in answer.tiles)
@@ -128,7 +128,7 @@ class SiteFeed:
         return self._known[0]
 
     def since(self, version: MapVersion | None) -> TilesAnswer | None:
-        """What a page that has a version needs to have the newest one; None while no map is known."""
+        """The difference from a page's version; None without a map."""
         if self.answer is None:
             return None
         now = self.answer.version
@@ -139,15 +139,15 @@ class SiteFeed:
         return replace(self.answer, whole=whole, tiles=tuple(tiles))
 
     def poses(self) -> list[dict[str, Any]]:
-        """Newest pose of each machine that said anything lately, and how old it is."""
+        """Newest pose of each recent machine, and its age."""
         return self._machines.poses()
 
     def reports(self) -> list[dict[str, Any]]:
-        """What each machine that spoke lately says of itself."""
+        """Status of each recent machine."""
         return self._machines.reports()
 
     def poses_text(self) -> str:
-        """The poses as pages are told of them, made once for all; empty for none."""
+        """Poses as sent to pages, shared; empty if none."""
         now_s = time.monotonic()
         if now_s - self._poses_text[0] >= PERIOD_S:
             poses = self.poses()
@@ -155,7 +155,7 @@ class SiteFeed:
         return self._poses_text[1]
 
     async def heard(self) -> None:
-        """Wait until a machine says where it is, but no longer than HEARD_S since somebody listens."""
+        """Wait for a first pose, at most HEARD_S from the start of listening."""
         loop = asyncio.get_running_loop()
         end_s = (self._listens_s or loop.time()) + HEARD_S
         while not self._machines and (left_s := end_s - loop.time()) > 0:
@@ -163,7 +163,7 @@ class SiteFeed:
 
     @contextlib.asynccontextmanager
     async def watched(self) -> Any:
-        """While somebody looks, the map is asked for what changed."""
+        """Follow the map while the block runs."""
         self.watchers += 1
         if self._task is None:
             self._task = asyncio.create_task(self._follow())
@@ -173,7 +173,7 @@ class SiteFeed:
             self.watchers -= 1
 
     async def close(self) -> None:
-        """End everything."""
+        """Release everything."""
         if self._task:
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -189,7 +189,7 @@ class SiteFeed:
             threads.shutdown(wait=False, cancel_futures=True)
 
     async def _follow(self) -> None:
-        """Ask again and again while somebody looks; ends when nobody does."""
+        """Query changes while anybody looks."""
         if self._listener is None:
             key = keys.poses_all(self.name)
             self._listener = await self.ask(Listener, self.client.session, key, self._pose, self._machines.on_pose)
@@ -216,14 +216,14 @@ class SiteFeed:
         self._task = None
 
     async def _look_for_server(self) -> None:
-        """Say soon that there is no map server: the first question to it waits longer for one that starts again."""
+        """Soon report a missing map server; a first query waits longer for a restarting one."""
         with contextlib.suppress(zenoh.ZError):  # the session was closed meanwhile
             is_there = await self.ask(is_answered, self.client.session, keys.map_query(self.name, "tiles"))
             self.is_away |= not is_there and self.answer is None
             self._notify()
 
     def _notify(self) -> None:
-        """Wake the pages where there is anything new to show; for poses five times a second."""
+        """Wake pages on news; for poses five times a second."""
         now_s, version = time.monotonic(), self.answer.version if self.answer else None
         heard = self._machines.heard if now_s - self._woken_s >= POSES_S else self._woken[-1]
         if (news := (version, self.is_away, self.state_text, heard)) != self._woken:
@@ -244,12 +244,12 @@ class SiteFeed:
         return info, machines, changes
 
     def tracks(self) -> dict[str, list[Pose]]:
-        """Where each machine was while somebody looked, oldest first."""
+        """Tracks since somebody looks, oldest first."""
         return self._machines.tracks()
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """How many poses were not believed, by reason."""
+        """Refused poses by reason."""
         return dict(self._listener.refused) if self._listener else {}
 
     def _pose(self, key: str, data: bytes) -> Pose:
@@ -261,7 +261,7 @@ async def _run(threads: ThreadPoolExecutor, question: Callable[..., T], *argumen
 
 
 def _live_text(name: str, info: MapInfo, machines: Iterable[MachineState], changes: Iterable[GroundChange]) -> str:
-    """What pages are told of a site whose map server answers."""
+    """State of a site as sent to pages."""
     site = {
         "name": name,
         "stamp_ns": info.stamp_ns,
@@ -278,7 +278,7 @@ def _tiles_bytes(answer: TilesAnswer) -> int:
 
 
 def receive_health(key: str, data: bytes) -> Health:
-    """The health report of the machine that its key names."""
+    """Health report of the machine named by its key."""
     health = decode_health(data)
     if not key.endswith(f"/machine/{health.machine}/health"):
         raise MessageError(Refusal.WRONG_MACHINE, f"{health.machine!r} sends under {key}", field="machine")

@@ -1,8 +1,8 @@
-"""Sockets of visitors: how many there may be, and which make room where there are too many.
+"""Visitors' sockets: limits, and which ones make room.
 
-A socket is counted when it is accepted, before TLS, and until it is closed, whatever it becomes: a handshake that never
-begins, half a request, a WebSocket. What waits for its peer makes room for who comes, the one that waits longest first;
-what is being answered stays, and so do WebSockets, which have a part of the places alone.
+A socket counts from acceptance, before TLS, until closed, whatever it becomes: a missing handshake, half a request, a
+WebSocket. Sockets that wait for their peer make room, longest waiting first. Answers in progress and WebSockets stay;
+the latter have a share of the places.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from typing import Any
 from protocol.errors import ConfigError
 
 CONNECTIONS = 500
-# 28 browsers behind one NAT that load the page at the same time (six sockets each, and the live one), or 100 pages that
-# are open behind a proxy; two such addresses leave places to others.
+# 28 browsers behind one NAT loading the page at once (six sockets each, and the live one), or 100 open pages behind a
+# proxy; two such addresses leave places to others.
 OF_ADDRESS = 200
-LIVE = 0.5  # of the places, for WebSockets: the others are for requests, which come and go
-SPARE = 50  # more of an address and in all, who are told that there are too many: beyond, a socket is closed at once
-QUEUE = 256  # of connections that the system holds until they are accepted
-AT_ONCE = 32  # accepted before requests are read again: none makes room before its request could be read
-FILES = 4096  # that are asked of the system
-OTHER_FILES = 100  # beside sockets of visitors: libraries, the log, links to routers
-STALLED_S = 30.0  # until a socket that takes nothing is closed
+LIVE = 0.5  # share for WebSockets; the rest is for short requests
+SPARE = 50  # extra sockets, per address and in all, that get a refusal; beyond, they are closed at once
+QUEUE = 256  # connections held by the system before acceptance
+AT_ONCE = 32  # accepted between reads: none makes room before its request could be read
+FILES = 4096  # requested from the system
+OTHER_FILES = 100  # besides visitors: libraries, log, router links
+STALLED_S = 30.0  # timeout of a socket that takes nothing
 OUT_OF_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 log = logging.getLogger("sitegrid.web.process")
 
 
 class Connection(socket.socket):
-    """A visitor's socket. waits: for its peer. is_live: a WebSocket. has_place: it is among those that there may be."""
+    """A visitor's socket. waits: for its peer. is_live: a WebSocket. has_place: within the limits."""
 
     def __init__(self, accepted: socket.socket, origin: str, listening: Listening) -> None:
         super().__init__(fileno=accepted.detach())
@@ -42,30 +42,30 @@ class Connection(socket.socket):
         self.waits, self.is_live, self.has_place = True, False, True
 
     def close(self) -> None:
-        """As a socket's own; its place is free."""
+        """Close and free its place."""
         if self.fileno() >= 0:
             self._listening.forget(self)
         super().close()
 
 
 class Listening(socket.socket):
-    """A listening socket that makes room. most: connections in all. counts: of what was refused, or made room."""
+    """A listening socket with limits. most: connections in all. counts: refusals, evictions."""
 
     def __init__(self, family: socket.AddressFamily, most: int = CONNECTIONS) -> None:
         super().__init__(family)
         self.counts: Counter[str] = Counter()
         self._most = most
         self._files: dict[int, Connection] = {}
-        self._origins: dict[str, dict[Connection, None]] = {}  # those that began to wait first come first
+        self._origins: dict[str, dict[Connection, None]] = {}  # longest waiting first
 
     def listen(self, backlog: int = QUEUE) -> None:
-        """As a socket's own; what the event loop says is how many it accepts at once."""
+        """Listen; asyncio's backlog is its number of accepts in a row."""
         super().listen(max(backlog, QUEUE))
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """As a socket's own; ConnectionAbortedError, which the event loop passes over, where there is no room.
+        """Accept; without room ConnectionAbortedError, which the event loop ignores.
 
-        What makes room is closed by the event loop in its next turns: until then who comes waits for it.
+        The event loop closes evicted sockets in its next turns; new ones wait for that.
         """
         if len(self._files) >= self._most + SPARE and len(self._files) > self._placed:
             raise BlockingIOError
@@ -74,7 +74,7 @@ class Listening(socket.socket):
         except OSError as error:
             if error.errno not in OUT_OF_FILES:
                 raise
-            self._make_room(self._fullest())  # the loop would log each attempt, with a traceback
+            self._make_room(self._fullest())  # the loop would log every attempt with a traceback
             self.refuse("")
             raise ConnectionAbortedError from None
         connection = Connection(accepted, origin_of(address[0]), self)
@@ -89,40 +89,40 @@ class Listening(socket.socket):
             self.refuse(connection.origin)
             connection.close()
             raise ConnectionAbortedError
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # of Linux: nothing else ends a peer that answers and takes nothing
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux only: nothing else ends a peer that responds but takes nothing
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED_S * 1e3))
         return connection, address
 
     @property
     def _placed(self) -> int:
-        """Connections but for those that make room."""
+        """Connections except evicted ones."""
         return sum(map(len, self._origins.values()))
 
     def connection(self, file: int) -> Connection:
-        """The visitor's socket with this number of its file."""
+        """Visitor's socket by file number."""
         return self._files[file]
 
     def waits(self, connection: Connection, *, now: bool) -> None:
-        """Note that a connection waits for its peer from now on, or that it is being answered."""
+        """Note that a connection waits for its peer, or is being answered."""
         connection.waits = now
         if now and connection in (own := self._origins.get(connection.origin, {})):
             own[connection] = own.pop(connection)
 
     def has_room_for_live(self, connection: Connection) -> bool:
-        """Whether there may be one more WebSocket, of its origin and in all."""
+        """Whether another WebSocket fits, for its origin and in all."""
         own = sum(one.is_live for one in self._origins[connection.origin])
         every = sum(one.is_live for one in self._files.values())
         return connection.has_place and own < LIVE * OF_ADDRESS and every < LIVE * self._most
 
     def forget(self, connection: Connection) -> None:
-        """A connection is closed."""
+        """Drop a closed connection."""
         self._files.pop(connection.fileno(), None)
         self._leave(connection)
 
     def refuse(self, origin: str) -> None:
-        """Count a socket that is refused, and name where it comes from."""
+        """Count a refused socket and log its origin."""
         self.counts["refused_connections"] += 1
-        if self.counts["refused_connections"].bit_count() == 1:  # the first, second, fourth...
+        if self.counts["refused_connections"].bit_count() == 1:  # 1st, 2nd, 4th...
             own, every = len(self._origins.get(origin, ())), len(self._files)
             log.warning("too many connections address=%s open=%d of_all=%d", origin, own, every)
 
@@ -130,7 +130,7 @@ class Listening(socket.socket):
         return max(self._origins.values(), key=len, default={})
 
     def _make_room(self, among: Iterable[Connection]) -> bool:
-        """End the one that waits longest; whether there is any. Its transport closes it, as if its peer had left."""
+        """Evict the longest waiting, if any. Its transport closes it, as if the peer had left."""
         longest = next((one for one in among if one.waits), None)
         if longest is None:
             return False
@@ -150,7 +150,7 @@ class Listening(socket.socket):
 
 
 def listen(address: tuple[str, int]) -> Listening:
-    """Listen on an address; ConfigError where that is not possible, or the system lets too few files be open."""
+    """Listen on an address; ConfigError if impossible, or if the limit of open files is too low."""
     host, port = address[0].strip("[]"), address[1]
     most = min(CONNECTIONS, _files() - OTHER_FILES - SPARE)
     if most < SPARE:
@@ -167,7 +167,7 @@ def listen(address: tuple[str, int]) -> Listening:
 
 
 def _files() -> int:
-    """How many files may be open, raised as far as is allowed."""
+    """Limit of open files, raised as far as allowed."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -177,7 +177,7 @@ def _files() -> int:
 
 
 def origin_of(host: str) -> str:
-    """Whose address it is: a host has all of an IPv6 network of 64 bits."""
+    """Origin of an address: an IPv6 /64 counts as one host."""
     address = ip_address(host.partition("%")[0])
     is_alone = address.version == 4 or address.ipv4_mapped
     return host if is_alone else str(ip_network((int(address), 64), strict=False))

@@ -1,7 +1,4 @@
-"""Parameters of requests to checked values, and values to JSON; what is wrong is a Problem, with its name.
-
-Problems are problem details (RFC 9457), with the reasons of the protocol.
-"""
+"""Request parameters to checked values, values to JSON; errors are problem details (RFC 9457) with protocol reasons."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ from sitegrid.times import iso
 
 Parameters = Mapping[str, str]
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-# What a reason of the protocol is over HTTP; any other one is the asker's mistake.
+# HTTP status by protocol reason; others are client errors.
 STATUS: dict[str, HTTPStatus] = {
     Refusal.UNKNOWN_QUERY: HTTPStatus.NOT_FOUND,
     Refusal.UNKNOWN_MACHINE: HTTPStatus.NOT_FOUND,
@@ -34,7 +31,7 @@ STATUS: dict[str, HTTPStatus] = {
 
 
 def stamp(parameters: Parameters, name: str) -> int | None:
-    """A time as a stamp [ns]: ISO 8601 (UTC where it names no zone) or nanoseconds; None where it is missing."""
+    """A time as a stamp [ns]: ISO 8601 (default zone UTC) or nanoseconds; None if missing."""
     text = parameters.get(name)
     if text is None:
         return None
@@ -54,14 +51,14 @@ def stamp(parameters: Parameters, name: str) -> int | None:
 
 
 def check_known(parameters: Parameters, known: tuple[str, ...]) -> None:
-    """Refuse a parameter that a resource does not take."""
+    """Refuse unknown parameters."""
     if unknown := sorted(set(parameters) - set(known)):
         takes = ", ".join(known) or "none"
         raise bad(Refusal.UNKNOWN_PARAMETER, f"parameter `{unknown[0][:40]}` is not known; known: {takes}")
 
 
 def plain(value: Any) -> Any:
-    """Records as tables, arrays as lists, NaN, which JSON does not know, as None; a stamp gets its time beside it."""
+    """Records as tables, arrays as lists, NaN as None for JSON; stamps get a time beside them."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, np.ndarray):
@@ -77,7 +74,7 @@ def plain(value: Any) -> Any:
 
 
 def with_times(table: Mapping[Any, Any]) -> dict[Any, Any]:
-    """A table in which each stamp has its time beside it."""
+    """Add a time beside each stamp."""
     times = {f"{key.removesuffix('_ns')}_time": iso(item) for key, item in table.items() if _is_stamp(key, item)}
     return {**table, **times}
 
@@ -87,7 +84,7 @@ def _is_stamp(key: object, value: object) -> bool:
 
 
 class RequestProblem(SitegridError):  # noqa: N818 - the word of RFC 9457
-    """A request that is refused, or that cannot be answered. reason: a word for programs, as in the protocol."""
+    """A refused or failed request. reason: a word for programs, as in the protocol."""
 
     def __init__(self, status: HTTPStatus, reason: str, detail: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(detail)
@@ -95,12 +92,12 @@ class RequestProblem(SitegridError):  # noqa: N818 - the word of RFC 9457
 
 
 def bad(reason: Refusal, detail: str) -> RequestProblem:
-    """A request that says something wrong."""
+    """A client error."""
     return RequestProblem(STATUS.get(reason, HTTPStatus.BAD_REQUEST), reason, detail)
 
 
 def problem_of(error: Exception) -> RequestProblem:
-    """An error as a problem; one that nobody expected says no more than that it was one."""
+    """An error as a problem; unexpected ones reveal nothing."""
     if isinstance(error, RequestProblem):
         return error
     if isinstance(error, QueryError):
@@ -116,7 +113,7 @@ def problem_of(error: Exception) -> RequestProblem:
 
 
 def problem_response(error: Exception) -> Response:
-    """The answer to a request that failed."""
+    """The response to a failed request."""
     problem = problem_of(error)
     body: dict[str, Any] = {
         "type": "about:blank",

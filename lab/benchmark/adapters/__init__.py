@@ -1,1 +1,1 @@
-"""Methods from outside of this project, entered like anybody's: they read samples and write maps."""
+"""External methods, entered like anybody's: samples in, maps out."""

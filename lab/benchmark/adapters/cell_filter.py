@@ -1,8 +1,8 @@
-"""A Kalman filter per cell and a fused read, in the manner of robot-centric elevation mapping (Fankhauser 2018).
+"""A Kalman filter per cell with a fused read, after robot-centric elevation mapping (Fankhauser 2018).
 
-`python -m lab.benchmark.adapters.cell_filter BENCH_DATA ENTRY`. Each sample updates the cell of its stated
-place; a value beyond the gate makes the cell less sure instead. When the map is read, a cell is fused with its
-neighbours as far as places are unsure, each by its likelihood and its variance.
+`python -m lab.benchmark.adapters.cell_filter BENCH_DATA ENTRY`. A sample updates the cell of its stated place; an
+outlier raises the cell's variance instead. A read fuses neighbouring cells within the position uncertainty, weighted by
+likelihood and variance.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 from lab.benchmark.adapters.files import Cell, Map, Samples, by_cell, enter
 
 GATE_SIGMA = 2.5
-OUTLIER_VARIANCES = 10.0  # that a rejected value adds, in its own
-FLOOR_M = 0.3  # least standard deviation of a place
-REACH_SIGMA = 2.0  # of the fused read
+OUTLIER_VARIANCES = 10.0  # variance added by an outlier, in units of its own
+FLOOR_M = 0.3  # smallest position standard deviation
+REACH_SIGMA = 2.0  # radius of the fused read
 LAYERS = (
     ("resistance", "c_rr", "c_rr_var"),
     ("grade_east", "grade_e", "grade_var"),
@@ -27,7 +27,7 @@ LAYERS = (
 
 
 def cell_filter(samples: Samples) -> Map:
-    """The map of one recording."""
+    """Map of one recording."""
     out: dict[Cell, dict[str, float]] = {}
     for layer, value, variance in LAYERS:
         for cell, fused in _fused(_filtered(samples, value, variance)).items():
@@ -36,7 +36,7 @@ def cell_filter(samples: Samples) -> Map:
 
 
 def _filtered(samples: Samples, value: str, variance: str) -> dict[Cell, tuple[float, float, float]]:
-    """Estimate, its variance, and the mean variance of places, by cell."""
+    """Estimate, its variance, and mean position variance by cell."""
     cells = {}
     spread = (samples["cov_xx_m2"] + samples["cov_yy_m2"]) / 2
     for cell, rows in by_cell(samples, value).items():
@@ -54,7 +54,7 @@ def _filtered(samples: Samples, value: str, variance: str) -> dict[Cell, tuple[f
 
 
 def _fused(cells: dict[Cell, tuple[float, float, float]]) -> dict[Cell, float]:
-    """Values of all cells that estimates reach: the mean of those, by how likely they belong there, and how sure."""
+    """All reached cells: mean of the estimates by likelihood and variance."""
     sums: dict[Cell, tuple[float, float]] = {}
     for (column, row), (x, p, place_m2) in cells.items():
         reach = math.ceil(REACH_SIGMA * math.sqrt(place_m2))

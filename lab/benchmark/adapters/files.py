@@ -1,4 +1,4 @@
-"""Samples in, maps out, for methods that enter the benchmark: nothing of this project is imported."""
+"""Samples in, maps out, for benchmark entries; imports nothing of this project."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 Column = NDArray[np.float64]
 Samples = Mapping[str, Column]  # columns of samples.csv (n,), oldest first
 Cell = tuple[int, int]  # column, row: floor of east and north [m]
-Map = Mapping[Cell, Mapping[str, float]]  # resistance, grade_east, grade_north and, if it likes, confidence
+Map = Mapping[Cell, Mapping[str, float]]  # resistance, grade_east, grade_north, optionally confidence
 COLUMNS = ("stamp_ns", "x_m", "y_m", "cov_xx_m2", "cov_yy_m2", "c_rr", "c_rr_var", "grade_e", "grade_n", "grade_var")
 VALUES = ("resistance", "grade_east", "grade_north", "confidence")
 
 
 def enter(method: Callable[[Samples], Map], data: Path, entry: Path) -> None:
-    """Run a method on all recordings of a folder, and write its maps into another one."""
+    """Run a method on a folder of recordings; write its maps to another."""
     entry.mkdir(parents=True, exist_ok=True)
     for path in sorted(data.glob("*/samples.csv")):
         write_map(entry / f"{path.parent.name}.csv", method(read_samples(path)))
 
 
 def read_samples(path: Path) -> Samples:
-    """The columns that methods use, oldest sample first."""
+    """Columns used by methods, oldest sample first."""
     with path.open(encoding="utf-8", newline="") as text:
         lines = list(csv.DictReader(text))
     columns = {name: np.array([float(line[name]) for line in lines]) for name in COLUMNS}
@@ -35,7 +35,7 @@ def read_samples(path: Path) -> Samples:
 
 
 def write_map(path: Path, cells: Map) -> None:
-    """Write a map as the benchmark reads it."""
+    """Write a map in the benchmark's format."""
     with path.open("w", encoding="utf-8", newline="") as text:
         writer = csv.writer(text)
         writer.writerow(["x_m", "y_m", *VALUES])
@@ -45,7 +45,7 @@ def write_map(path: Path, cells: Map) -> None:
 
 
 def by_cell(samples: Samples, value: str) -> dict[Cell, list[int]]:
-    """Samples that have a value, by the cell of their stated place."""
+    """Indices of samples with a value, by stated cell."""
     cells: dict[Cell, list[int]] = {}
     places = zip(samples["x_m"].tolist(), samples["y_m"].tolist(), samples[value].tolist(), strict=True)
     for i, (x_m, y_m, known) in enumerate(places):

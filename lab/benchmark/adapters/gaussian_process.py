@@ -1,8 +1,8 @@
 """Gaussian processes by scikit-learn (extra `entries`), one per block of ground.
 
-`python -m lab.benchmark.adapters.gaussian_process BENCH_DATA ENTRY`. The samples of a cell are averaged first;
-resistance is regressed as its logarithm, so that concrete counts as much as sand. Lengths and variances are set, not
-fitted: what is fitted to borders of soils blurs them.
+`python -m lab.benchmark.adapters.gaussian_process BENCH_DATA ENTRY`. Samples are averaged by cell; resistance is
+regressed as logarithm, so that concrete counts as much as sand. Lengths and variances are fixed: fitted to soil
+borders, they blur them.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from lab.benchmark.adapters.files import Cell, Column, Map, Samples, by_cell, enter
 
-BLOCK_M, MARGIN_M = 24, 6  # the ground of one process, and what it sees beyond
+BLOCK_M, MARGIN_M = 24, 6  # ground of one process, and its margin
 LENGTH_M = 2.0
-NEAR_M = 2  # cells so far from a sample are predicted
-# Prior deviation, and deviation of a cell's mean beside what its samples state: borders, slow errors of places.
+NEAR_M = 2  # predicted cells: within this distance of a sample
+# Prior standard deviation, and noise of a cell's mean beyond stated variances: borders, slow position errors.
 PRIOR = {"c_rr": (1.3, 0.1), "grade_e": (0.1, 0.01), "grade_n": (0.1, 0.01)}
-EDGES = np.log([1e-9, 0.014, 0.03, 0.05, 0.155, 1e9])  # of the five kinds of ground
+EDGES = np.log([1e-9, 0.014, 0.03, 0.05, 0.155, 1e9])  # between the five ground classes
 LAYERS = {"resistance": "c_rr", "grade_east": "grade_e", "grade_north": "grade_n"}
 
 
 def gaussian_process(samples: Samples) -> Map:
-    """The map of one recording."""
+    """Map of one recording."""
     out: dict[Cell, dict[str, float]] = {}
     for layer, value in LAYERS.items():
         for cell, (mean, std) in _predicted(samples, value).items():
@@ -40,14 +40,14 @@ def gaussian_process(samples: Samples) -> Map:
 
 
 def _likely(mean: float, std: float) -> float:
-    """How likely the kind of ground is that the mean lies in."""
+    """Probability of the mean's ground class."""
     below = ndtr((EDGES - mean) / std)
     kind = int(np.searchsorted(EDGES, mean)) - 1
     return float(below[kind + 1] - below[kind])
 
 
 def _predicted(samples: Samples, value: str) -> dict[Cell, tuple[float, float]]:
-    """Mean and standard deviation of all cells near samples, block by block."""
+    """Mean and standard deviation of cells near samples, by block."""
     cells = by_cell(samples, value)
     z = np.log(np.maximum(samples[value], 1e-3)) if value == "c_rr" else samples[value]
     places = np.array(sorted(cells))

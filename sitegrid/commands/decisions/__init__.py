@@ -1,1 +1,1 @@
-"""Commands by which a person decides something that the map server keeps."""
+"""Commands for persistent decisions about a map server's data."""

@@ -1,4 +1,4 @@
-"""`sitegrid accept`: let the map server's store take the place of another one, which is gone."""
+"""`sitegrid accept`: let the map server's store replace a lost one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Accept the store, and say what follows."""
+    """Accept the store and state the consequence."""
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         info = client.accept(arguments.store, arguments.reason)
     line = f"store {info.store} takes the place of {arguments.store}: what it lacks of machines' samples counts as lost"

@@ -1,4 +1,4 @@
-"""`sitegrid calibrate`: calibrate all machines now, or decide what is taken off the samples of one."""
+"""`sitegrid calibrate`: calibrate all machines now, or decide one machine's corrections."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Have it done, wait until the map follows, print what is known of the machines then."""
+    """Calibrate, wait for the map, print the calibration."""
     values = {name: getattr(arguments, name) for name in ("zero", "scale", "across")}
     given = [f"--{name}" for name, value in values.items() if value is not None] + ["--auto"] * arguments.auto
     if given and not arguments.machine:

@@ -1,4 +1,4 @@
-"""`sitegrid distrust`: leave a machine's samples out of the map."""
+"""`sitegrid distrust`: exclude a machine's samples from the map."""
 
 from __future__ import annotations
 

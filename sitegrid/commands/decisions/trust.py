@@ -1,4 +1,4 @@
-"""`sitegrid trust`: use a machine's samples, even if they contradict other machines."""
+"""`sitegrid trust`: use a machine's samples despite contradictions."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def add_decision(parser: ArgumentParser) -> None:
-    """Options of every decision about a machine."""
+    """Options of decisions about a machine."""
     parser.add_argument("machine", metavar="MACHINE")
     add_site(parser)
     add_wait(parser)
 
 
 def add_wait(parser: ArgumentParser) -> None:
-    """How long to wait for what follows from a decision."""
+    """Timeout for a decision's effects."""
     waits = "seconds to wait until the map is folded again (default %(default)g)"
     parser.add_argument("--wait", type=not_negative, default=30.0, help=waits)
 
 
 def run(arguments: Namespace) -> int:
-    """Trust the machine, or leave it to the map server."""
+    """Trust the machine, or let the map server decide."""
     machine, wait_s = arguments.machine, arguments.wait
     if arguments.auto:
         return decide(arguments, lambda client: client.judge_automatically(machine, wait_s=wait_s))
@@ -43,7 +43,7 @@ def run(arguments: Namespace) -> int:
 
 
 def decide(arguments: Namespace, command: Callable[[Client], TrustAnswer]) -> int:
-    """Give the command, wait until the map follows, print what is known of the machine then."""
+    """Execute the decision, wait for the map, print the machine's state."""
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
         machine = command(client)
     state = "is trusted" if machine.trusted else "is left out of the map"

@@ -1,1 +1,1 @@
-"""Pictures of the map in tiles as web maps have them: zoom, column, row."""
+"""Map pictures as web map tiles: zoom, column, row."""

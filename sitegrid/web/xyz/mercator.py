@@ -1,4 +1,4 @@
-"""XYZ tiles in Web Mercator: which cells of the site a tile's pixels lie in, and the tile as a PNG."""
+"""XYZ tiles in Web Mercator: cells under a tile's pixels, and the PNG."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from protocol.site.site_config import Projection
 
 SIDE_PX = 256
 MAX_ZOOM = 24
-RADIUS_M = 6378137.0  # of the sphere of Web Mercator
-# Values as 24 bits in red, green, blue: value = offset + scale (65536 r + 256 g + b); 0 is unknown.
+RADIUS_M = 6378137.0  # Web Mercator's sphere
+# 24-bit values in RGB: value = offset + scale (65536 r + 256 g + b); 0: unknown.
 COARSE = dict.fromkeys(("age_s", "changed_s"), (1.0, -1.0)) | dict.fromkeys(
     ("visits", "machines", "weight"), (1e-3, -1e-3)
 )
-FINE = (1e-6, -4.0)  # single precision, and all of a slope's or angle's range
+FINE = (1e-6, -4.0)  # single precision over the range of slopes and angles
 MOST = 2**24 - 1
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """Positions in `map` [m] of a tile's pixel centres, both (256, 256), row 0 in the north.
+    """Pixel centres of a tile in `map` [m], both (256, 256), row 0 in the north.
 
-    Infinite on the far side of the Earth, which the site's projection does not reach.
+    Infinite on the far side of the Earth, beyond the site's projection.
     """
 
     x_m: Floats
     y_m: Floats
 
     def bounds(self, known: Bounds, cell_m: float) -> Bounds | None:
-        """The rectangle of those that lie in a known one, a cell wider; None without any."""
+        """Bounds of pixels inside `known`, one cell wider; None if there are none."""
         x, y = self.x_m, self.y_m
         inside = (x >= known.west_m) & (x < known.east_m) & (y >= known.south_m) & (y < known.north_m)
         if not inside.any():
@@ -44,7 +44,7 @@ class Pixels:
         return Bounds(float(west) - cell_m, float(south) - cell_m, float(east) + cell_m, float(north) + cell_m)
 
     def sample(self, layer: Floats32, first_x_m: float, first_y_m: float, cell_m: float) -> Floats:
-        """The cell that each pixel lies in (256, 256), NaN outside; first_x_m, first_y_m: the layer's outer corner."""
+        """Cell value per pixel (256, 256), NaN outside; first_x_m, first_y_m: the layer's outer corner."""
         column, row = np.floor((self.x_m - first_x_m) / cell_m), np.floor((self.y_m - first_y_m) / cell_m)
         inside = (column >= 0) & (row >= 0) & (column < layer.shape[1]) & (row < layer.shape[0])
         out = np.full(column.shape, np.nan)
@@ -53,7 +53,7 @@ class Pixels:
 
 
 def pixels_of(z: int, x: int, y: int, projection: Projection) -> Pixels:
-    """Where the pixels of a tile lie."""
+    """Pixel centres of a tile."""
     n = 2**z * SIDE_PX
     lon_deg = (x * SIDE_PX + np.arange(SIDE_PX) + 0.5) / n * 360.0 - 180.0
     north = math.pi * (1 - 2 * (y * SIDE_PX + np.arange(SIDE_PX) + 0.5) / n)
@@ -63,29 +63,29 @@ def pixels_of(z: int, x: int, y: int, projection: Projection) -> Pixels:
 
 
 def tiles_at(lat_deg: Floats, lon_deg: Floats, z: int) -> tuple[Floats, Floats]:
-    """Columns and rows of tiles of places, with what is behind the point: where in the tile they lie."""
+    """Fractional tile columns and rows of places."""
     row = (1 - np.arcsinh(np.tan(np.radians(lat_deg))) / math.pi) / 2 * 2**z
     return (lon_deg + 180.0) / 360.0 * 2**z, row
 
 
 def pixel_m(z: int, lat_deg: float) -> float:
-    """Edge of a pixel on the ground [m]."""
+    """Pixel edge on the ground [m]."""
     return float(2 * math.pi * RADIUS_M * math.cos(math.radians(lat_deg)) / (2**z * SIDE_PX))
 
 
 def tile_at(lat_deg: float, lon_deg: float, z: int) -> tuple[int, int]:
-    """Column and row of the tile that a place lies in."""
+    """Column and row of a place's tile."""
     column, row = tiles_at(np.array(lat_deg), np.array(lon_deg), z)
     return int(column), int(row)
 
 
 def coding(layer: str) -> tuple[float, float]:
-    """Scale and offset of a layer's values in 24 bits."""
+    """Scale and offset of a layer's 24-bit values."""
     return COARSE.get(layer, FINE)
 
 
 def value_png(values: Floats, layer: str) -> bytes:
-    """Values (256, 256) in 24 bits; what is beyond them takes the end."""
+    """Values (256, 256) in 24 bits, clipped."""
     known = ~np.isnan(values)
     scale, offset = coding(layer)
     steps = np.clip(np.rint((np.where(known, values, 0) - offset) / scale), 1, MOST)
@@ -94,7 +94,7 @@ def value_png(values: Floats, layer: str) -> bytes:
 
 
 def colour_png(values: Floats, layer: str) -> bytes:
-    """Values (256, 256) in the layer's colours; transparent where unknown."""
+    """Values (256, 256) in the layer's colours; transparent if unknown."""
     known = ~np.isnan(values)
     colours = _colours(np.where(known, values, 0.0), layer)
     alpha = np.where(known, 255, 0)[..., None]
@@ -102,15 +102,15 @@ def colour_png(values: Floats, layer: str) -> bytes:
 
 
 def empty_png(kind: str) -> bytes:
-    """A tile of either kind in which nothing is known."""
+    """A tile without known cells."""
     return EMPTY_VALUES if kind == "value" else EMPTY_COLOURS
 
 
-# Ends of a layer's palette; what is not here takes those of a share. Ages and counts are seen by their logarithm.
+# Ends of palettes, default those of a share. Ages and counts are shown logarithmically.
 ENDS = {"grade": (0.0, 0.3), "grade_std": (0.0, 0.2), "grade_east": (-0.3, 0.3), "grade_north": (-0.3, 0.3)}
 LOGARITHMIC = {"resistance": (0.006, 0.3), "visits": (1.0, 60.0), "age_s": (10.0, 86400.0), "weight": (0.1, 1000.0)}
 LOGARITHMIC |= {"resistance_std": (0.0005, 0.1), "changed_s": (10.0, 86400.0), "machines": (1.0, 60.0)}
-# Dark blue to yellow: ends of the page's ordered palette and points between them, even in OKLab; BGR.
+# Dark blue to yellow: the page's ordered palette, evenly spaced in OKLab; BGR.
 ORDERED = np.array(
     [(119, 55, 36), (127, 71, 51), (140, 108, 90), (141, 139, 130), (131, 154, 155), (120, 190, 186), (92, 221, 251)]
 )

@@ -1,6 +1,6 @@
-"""XYZ tiles whose pixels are larger than cells: each pixel has the mean of what is known in it, however little that is.
+"""XYZ tiles with pixels larger than cells: the mean of known cells under each pixel.
 
-The map is read in parts, those that somebody drove in: a tile costs what is known below it, not what it covers.
+The map is read in driven parts, so a tile costs what is known below it, not its area.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from sitegrid.client import Client
 from sitegrid.web.xyz import mercator
 from sitegrid.web.xyz.mercator import SIDE_PX
 
-LEAST_CELLS = 3.0  # edges of cells in that of a pixel: below, a pixel shows the cell at its centre
-FILL = 1.5  # a pixel's edge over that of the larger cells that it is made of: none is without one, turned anyhow
-PART_TILES = 16  # tiles of the map to a side of a part: a million cells in one question
+LEAST_CELLS = 3.0  # pixel edge in cells; below, a pixel shows the cell at its centre
+FILL = 1.5  # pixel edge over its coarse cells' edge: every pixel gets one at any rotation
+PART_TILES = 16  # map tiles per side of a part: a million cells per query
 PART_CELLS = PART_TILES * TILE_CELLS
 Place = tuple[int, int, int]  # zoom, column and row of an XYZ tile
 
@@ -30,7 +30,7 @@ Place = tuple[int, int, int]  # zoom, column and row of an XYZ tile
 def draw(
     client: Client, tiles: Iterable[tuple[int, int]], layer: str, place: Place, cell_m: float, projection: Projection
 ) -> Floats:
-    """Values (256, 256) of an XYZ tile, NaN where nothing is known. tiles: those of the map that have any ground."""
+    """Values (256, 256) of an XYZ tile, NaN unknown. tiles: map tiles with any ground."""
     pixel_m = mercator.pixel_m(place[0], projection.to_geodetic(0.0, 0.0)[0])
     most_m = min(pixel_m / FILL, MAX_RESOLUTION_M, PART_CELLS * cell_m)
     edge_m = cell_m * 2 ** max(0, math.floor(math.log2(most_m / cell_m)))
@@ -43,7 +43,7 @@ def draw(
         column, row = _pixels(x_m, y_m, place, projection)
         inside = (column >= 0) & (column < SIDE_PX) & (row >= 0) & (row < SIDE_PX)
         pixel, values = (row * SIDE_PX + column)[inside], region[layer][rows, columns][inside]
-        if resolution_m is None:  # kinds and directions: any one of them
+        if resolution_m is None:  # classes and directions: any one
             total[pixel], count[pixel] = values, 1
         else:
             total += np.bincount(pixel, values, len(total))
@@ -55,7 +55,7 @@ def draw(
 def _parts_in(
     tiles: Iterable[tuple[int, int]], place: Place, pixel_m: float, cell_m: float, projection: Projection
 ) -> Iterator[Bounds]:
-    """Parts of the map with any ground that may lie in an XYZ tile."""
+    """Driven parts that may overlap an XYZ tile."""
     edge_m, n = TILE_CELLS * cell_m, 2 ** place[0] * SIDE_PX
     parts = defaultdict[tuple[int, int], list[tuple[int, int]]](list)
     for x, y in tiles:
@@ -65,7 +65,7 @@ def _parts_in(
         bounds = Bounds(float(west_m), float(south_m), float(east_m + edge_m), float(north_m + edge_m))
         middle = np.array([[west_m + east_m], [south_m + north_m]]) / 2 + edge_m / 2
         column, row = _pixels(middle[0], middle[1], place, projection)
-        reach_px = SIDE_PX / 2 + PART_CELLS * cell_m / pixel_m  # from the tile's centre to that of a part
+        reach_px = SIDE_PX / 2 + PART_CELLS * cell_m / pixel_m  # centre of the tile to centre of a part
         east_px = (float(column[0]) - SIDE_PX / 2 + n / 2) % n - n / 2
         if abs(east_px) <= reach_px and abs(float(row[0]) - SIDE_PX / 2) <= reach_px:
             yield bounds
