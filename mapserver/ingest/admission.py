@@ -1,4 +1,4 @@
-"""What may enter the journal: the rules of identity, as pure functions."""
+"""What may enter the journal: rules of identity as pure functions."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from protocol.wire import keys
 from protocol.wire.messages import SampleBatch
 
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
-FUTURE_NS = DAY_NS  # clocks set to the wrong zone or day are less wrong
+FUTURE_NS = DAY_NS  # clocks of the wrong zone or day are less wrong
 FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01: an earlier server clock is wrong
 
 
 class GapError(MessageError):
-    """A batch starts beyond the next expected sample and does not declare those before as lost."""
+    """A batch starts beyond the next expected sample, without declaring a loss."""
 
     def __init__(self, first_seq: int, expected: int) -> None:
         problem = f"{first_seq}: sample {expected} is expected next; send from there, or say lost_before"
@@ -28,10 +28,9 @@ class GapError(MessageError):
 
 @dataclass(frozen=True)
 class SeenTime:
-    """Times known to a store besides the server's clock.
+    """Times known to a store besides the server's clock, 0 for none.
 
-    others_ns, newest_ns: newest stamp of the other trusted machines, and of all. received_ns: the server's clock at the
-    last row. 0 for none.
+    others_ns, newest_ns: newest stamp of other trusted machines, and of all. received_ns: server time of the last row.
     """
 
     others_ns: int = 0
@@ -51,10 +50,7 @@ def judge_batch(
     now_ns: Callable[[], int],
     seen: Callable[[str], SeenTime] = nothing_seen,
 ) -> None:
-    """Check a decoded batch that came under the key of `machine`; MessageError names the fault.
-
-    seen: of a sender; only asked about batches from the future.
-    """
+    """Check a batch that came under a machine's key; MessageError names the fault. seen: asked about future batches."""
     if batch.machine != machine:
         problem = f"{batch.machine!r} sends under the key of {machine!r}"
         raise MessageError(Refusal.WRONG_MACHINE, problem, field="machine")
@@ -66,7 +62,7 @@ def judge_batch(
 
 
 def _check_newest(batch: SampleBatch, site: SiteConfig, now_ns: int, seen: Callable[[str], SeenTime]) -> None:
-    """Refuse stamps that move the site's now: one sample of 2099 would make all others old."""
+    """Refuse stamps that move the site's now: a sample of 2099 would make all others old."""
     row = int(batch.rows["stamp_ns"].argmax())
     stamp_ns = int(batch.rows["stamp_ns"][row])
     ahead_ns = stamp_ns - now_ns
@@ -92,7 +88,7 @@ def _days(span_ns: int) -> str:
 def check_store(batch: SampleBatch, identity: StoreIdentity, accepted: Collection[str]) -> str:
     """The id of the store that this one replaces for a batch, or ""; MessageError if it may not.
 
-    accepted: ids of stores that a person let this one replace.
+    accepted: ids of stores that people replaced.
     """
     if batch.store in ("", identity.id):
         return ""
@@ -115,9 +111,9 @@ def signature_problem(verify: Verify, site: str, machine: str, payload: bytes, s
 
 
 def admit(batch: SampleBatch, watermark: int) -> Admission:
-    """Drop samples up to the watermark; GapError if samples before the batch are missing.
+    """Drop samples up to the watermark; GapError if earlier ones are missing.
 
-    An empty batch asks for the watermark and may declare losses at the end; it is never a gap.
+    An empty batch asks for the watermark, may declare losses, and is never a gap.
     """
     expected = watermark + 1
     missing = batch.first_seq - expected

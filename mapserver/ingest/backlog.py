@@ -1,7 +1,7 @@
-"""Batches that wait for a commit: limited in bytes, served in turn by machine. No threads, no clock.
+"""Batches waiting for a commit: limited in bytes, in turn by machine. No threads, no clock.
 
-A machine sends one batch at a time, but after an outage all machines catch up. When full, the machine with most bytes
-loses its newest batch: live data passes late data, and no machine blocks another.
+After an outage all machines catch up. When full, the machine with most bytes loses its newest batch: live data passes
+late data, and no machine blocks another.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
-QUEUE_BYTES = 64 * 2**20  # waiting bytes, half a minute of work; more is not worth the memory
-BATCH_BYTES = 1024  # of a batch besides its payload: the query that waits for a reply
-GROUP_BATCHES = 256  # per commit, which costs one sync
-GROUP_BYTES = 4 * 2**20  # per commit, one batch at least; this many samples take 0.1 s
+QUEUE_BYTES = 64 * 2**20  # waiting at most: half a minute of work is not worth more
+BATCH_BYTES = 1024  # of a batch besides its payload: the query waiting for a reply
+GROUP_BATCHES = 256  # per commit, for one sync
+GROUP_BYTES = 4 * 2**20  # per commit, one batch at least; takes 0.1 s
 FIRST_BYTES_PER_S = 4 * 2**20  # until measured
 PACE_WEIGHT = 0.1  # of the newest group in the running mean
 MOST_RETRY_S = 30.0
@@ -48,7 +48,7 @@ class Backlog(Generic[T]):
         return self._count
 
     def add(self, machine: str, size: int, batch: T) -> list[T]:
-        """Queue a batch; returns the batches dropped for it, or the batch itself if there is no room."""
+        """Queue a batch; returns those dropped for it, or itself if there is no room."""
         gone: list[T] = []
         while self.size + size > self._limit:
             largest = max(self._lanes, key=lambda name: self._lanes[name].size, default=machine)

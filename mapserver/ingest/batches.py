@@ -1,7 +1,4 @@
-"""Decodes the batches of one commit together, in one pass over all samples.
-
-Refusals and reasons equal those of `protocol.wire.codec.decode_batch`.
-"""
+"""Decodes the batches of a commit in one pass; refuses as `protocol.wire.codec.decode_batch` does."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from protocol.machine.samples import COLUMNS, LIMITS, NAN_ALLOWED, SAMPLE_DTYPE,
 from protocol.wire.codec import unpack_batch
 from protocol.wire.messages import PackedBatch, SampleBatch
 
-# Rows as 32-bit words: a stamp and two coordinates of two words each, then float32.
+# rows as 32-bit words: a stamp and two coordinates of two words, then float32
 _WORD = np.dtype("<u4")
 _WIDTHS = np.array([SAMPLE_DTYPE[name].itemsize // _WORD.itemsize for name in COLUMNS])
 _WORDS = int(_WIDTHS.sum())
@@ -28,16 +25,13 @@ _FIRST_SINGLE = _WORDS - len(_SINGLE)
 _LOW, _HIGH = (np.array([LIMITS[name][end] for name in _SINGLE], np.float32) for end in (0, 1))
 _FIRST_NS, _LAST_NS = LIMITS["stamp_ns"]
 _XX, _XY, _YY = (_FIRST_SINGLE + _SINGLE.index(name) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
-# Bit sets of columns that may be NaN, only as a group.
+# bits of columns that may be NaN, only as a group
 _NAN_GROUPS = tuple(sum(1 << _SINGLE.index(name) for name in names) for names in NAN_ALLOWED)
 _NAN_ALLOWED = sum(_NAN_GROUPS)
 
 
 def decode_batches(payloads: Sequence[bytes], extent_m: float) -> list[SampleBatch | MessageError]:
-    """Decode and check batches; returns each one, or its error. Their rows share one table.
-
-    extent_m: largest distance of a position from the origin.
-    """
+    """Decode and check batches; returns batches or errors. Rows share one table. extent_m: most from the origin."""
     unpacked = [_unpack(payload) for payload in payloads]
     packed = [batch for batch in unpacked if isinstance(batch, PackedBatch)]
     table, plausible = _decode(packed, extent_m)
@@ -86,7 +80,7 @@ def _batch(batch: PackedBatch, rows: Table, extent_m: float, is_plausible: bool)
 
 @numba.njit(cache=True, nogil=True)
 def _interleave(columns: Any, lengths: Any, out: Any) -> None:
-    """Transpose the columns of consecutive batches to rows (n, words)."""
+    """Transpose consecutive batches' columns to rows (n, words)."""
     at, first = 0, 0
     for n in lengths:
         word = 0
@@ -101,7 +95,7 @@ def _interleave(columns: Any, lengths: Any, out: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _judge(rows: Any, singles: Floats32, lengths: Any, extent_m: float, plausible: Any) -> None:
-    """Whether each batch passes `check_samples`; singles: the same rows as float32."""
+    """Whether batches pass `check_samples`; singles: the same rows as float32."""
     k = 0
     for batch in range(len(lengths)):
         plausible[batch] = True

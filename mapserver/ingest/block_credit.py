@@ -1,9 +1,8 @@
-"""Credit for ground: a machine may open as much of the map as it has driven for. No files, no clock.
+"""Credit for ground: a machine may open as much map as it has driven for. No files, no clock.
 
-A block costs memory for the map's life, and one sample of 80 bytes opens up to four: scattered ones would cost 7 kB
-each. On opened ground each adds a page for its bucket. Refused samples are never journalled, so the map stays a
-function of the journal. Credit is not stored: after a restart all machines count as new
-(docs/decisions/0011-credit-for-new-ground.md).
+A block costs memory for the map's life. One sample of 80 bytes opens up to four: scattered, each costs 7 kB; on open
+ground each adds a page per bucket. Refused samples are not journalled, so the map stays a function of the journal.
+Credit is lost on restart: all machines are new then (docs/decisions/0011-credit-for-new-ground.md).
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import empty
 from protocol.site.geometry import BLOCK_CELLS
 
-JUMPS = 50  # jumps to new ground, each of the blocks a sample can open: 200 blocks with 1 m cells
+JUMPS = 50  # jumps to new ground, of the blocks a sample can open: 200 with 1 m cells
 JUMP_M = 200.0  # metres driven per further jump
-PAGES, FIRST_PAGES = 4000.0, 500.0  # blocks of opened ground, up to 11 kB each: limit, and of a new machine
-STAY_S = 30.0  # server seconds that earn a sample's pages: standing, a machine has one bucket in 300 s
-# Share of a newcomer's credit that the next one lacks, and that a minute restores: without keys, names are free.
+PAGES, FIRST_PAGES = 4000.0, 500.0  # opened blocks, of up to 11 kB: at most, and for a new machine
+STAY_S = 30.0  # server seconds that earn a sample's pages; standing costs one bucket in 300 s
+# of newcomers' credit: less for the next, and regained per minute; without keys, names are free
 NEWCOMER = 1 / 64
 MOST_ACCOUNTS = 4096
-MOST_PAIRS = 2048  # blocks times buckets remembered of a machine; 300 s at 25 m/s on new ground enter 1400
+MOST_PAIRS = 2048  # remembered blocks times buckets; 300 s at 25 m/s on new ground enter 1400
 
 
 class Credit(NamedTuple):
@@ -44,7 +43,7 @@ class Credit(NamedTuple):
 
 @dataclass(frozen=True)
 class Account:
-    """A machine's credit, position, and the blocks entered, by bucket. seen_ns: server time of its last batch."""
+    """A machine's credit, position, and entered blocks by bucket. seen_ns: server time of its last batch."""
 
     credit: Credit
     seen_ns: int
@@ -64,8 +63,8 @@ class BlockCredit:
     def __init__(self, cell_m: float, config: FoldConfig, opened: Iterable[Block]) -> None:
         self.opened, self._accounts = {block_key(*block) for block in opened}, dict[str, Account]()
         self._limits, self._entered = (cell_m, STD_FLOOR_M**2, config.std_cap_m**2), np.empty((1, 2), np.int64)
-        # A square moves over new ground, as wide as a sample's votes plus position errors on both sides. At 45 degrees
-        # it meets sqrt(2) times as many blocks.
+        # New ground is met by a moving square, as wide as votes plus position errors on both sides; at 45 degrees it
+        # meets sqrt(2) times as many blocks.
         std = math.hypot(config.std_cap_m, STD_FLOOR_M) / cell_m
         edge = 2 * math.ceil(2 * std) + 1
         swept = BLOCK_CELLS + edge - 1 + 2 * SIGMAS * std
@@ -78,8 +77,8 @@ class BlockCredit:
     def spend(self, machine: str, rows: Table, trimmed: int = 0, now_ns: int = 0) -> None:
         """Open the blocks of a machine's new samples; trimmed: samples of the batch before them.
 
-        now_ns: server time. MessageError names the first sample without credit; then nothing is opened. The sender
-        drops a sample refused alone, so the machine's position and metres count from there.
+        now_ns: server time. MessageError names the first sample without credit; nothing is opened then. Senders drop a
+        sample refused alone, so its position and metres count.
         """
         before, steps = self._account(machine, now_ns), np.empty((len(rows), 2))
         place = (before.x_m, before.y_m, before.has_jumped, before.stamp_ns)

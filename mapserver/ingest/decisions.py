@@ -1,4 +1,4 @@
-"""All decisions of a store, on trust and calibration, and their resulting facts."""
+"""A store's decisions on trust and calibration, and their facts."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Decisions:
 
     @classmethod
     def of_journal(cls, journal: JournalQueries) -> Decisions:
-        """Decisions of a journal; StoreError if another program wrote one."""
+        """A journal's decisions; StoreError if another program wrote one."""
         decisions = cls()
         decisions.hear(journal.events(), journal.where)
         return decisions
 
     def hear(self, events: Iterable[Event], where: str) -> None:
-        """Apply decisions among a journal's further events; StoreError as `of_journal`."""
+        """Apply decisions among further events; StoreError as `of_journal`."""
         number = self.facts.number
         for event in events:
             if event.kind in KINDS:
@@ -53,9 +53,9 @@ class Decisions:
         self._conclude(number)
 
     def offer(self, machine: str) -> dict[str, Any] | None:
-        """A calibration that a machine may adopt, as in an acknowledgement; None for none.
+        """A calibration for a machine to adopt, as acknowledgements have it, or None.
 
-        It is the newest correction, dated by the solver's last confirmation; machines adopt no old one.
+        It is its newest correction, dated by the solver's last confirmation: machines adopt no old one.
         """
         newest = self.facts.corrections.newest(machine)
         if not newest or newest.to_ns < LAST_NS or not newest.covariance:
@@ -80,7 +80,7 @@ class Decisions:
 
 
 def calibrations(journal: JournalQueries) -> list[CalibrationDecision]:
-    """Calibration decisions of a journal, in order; StoreError as `Decisions.of_journal`."""
+    """A journal's calibration decisions, in order; StoreError as `Decisions.of_journal`."""
     decisions = (_decision(event, journal.where) for event in journal.events(CALIBRATION))
     return [decision for decision in decisions if isinstance(decision, CalibrationDecision)]
 

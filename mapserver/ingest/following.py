@@ -1,6 +1,6 @@
-"""A replica that follows a journal, on its own thread or turn by turn, and its readers.
+"""A replica that follows a journal, on its own thread or by turns, and its readers.
 
-If its rows vanish from the journal (`mapserver/journal/tail.py`), the map is dropped and folded again.
+If its rows vanish (`mapserver/journal/tail.py`), the map is dropped and folded again.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from protocol.errors import QueryError, Refusal, StoreError
 from protocol.site.site_config import SiteConfig
 
 ASK_S = 1.0  # polling interval, because notifications may be lost
-OPEN_S = 2.0  # lifetime of a connection, because its file may be replaced
-PAUSE_S, MOST_PAUSE_S = 0.1, 5.0  # after unreadable rows; doubled, because reading up to them takes time
+OPEN_S = 2.0  # lifetime of a connection, whose file may be replaced
+PAUSE_S, MOST_PAUSE_S = 0.1, 5.0  # after unreadable rows; doubles, because reading up to them takes time
 T = TypeVar("T")
 log = logging.getLogger("mapserver.ingest.following")
 
 
 class UnfitError(StoreError):
-    """The journal belongs to another site or frame."""
+    """A journal of another site or frame."""
 
 
 class Following:
-    """A replica and its upkeep. Thread-safe, except for turns.
+    """A replica and its upkeep; thread-safe, except for turns.
 
-    waits: for merged rows. past: sources of past maps. ended: why it gave up, or ""; the process should then end.
+    waits: for merged rows. past: source of past maps. ended: why it gave up, or "".
     """
 
     def __init__(self, location: JournalLocation, site: SiteConfig, config: ServerConfig) -> None:
@@ -65,21 +65,21 @@ class Following:
         self._thread.start()
 
     def read_once(self) -> None:
-        """Read what is there now, on the caller's thread, in place of following; StoreError if that fails."""
+        """Read once on the caller's thread, instead of following; StoreError if that fails."""
         reader = self._opened()
         complete_s = reader.complete_s()
         self._look(reader, reader.state(), complete_s)
         self._close_reader()
 
     def run(self, work: Callable[[Replica], T]) -> T:
-        """Run `work` on the replica; QueryError if there is none."""
+        """Run `work` on the replica; QueryError without one."""
         with self._lock:
             if self._replica is None or not self._is_whole:
                 raise QueryError(Refusal.NOT_HERE, "this follower has no map yet; ask the map server")
             return work(self._replica)
 
     def behind(self) -> tuple[int, float]:
-        """Rows that the map lacks, and seconds since it was complete (inf for never)."""
+        """Rows missing from the map, and seconds since none was (inf for never)."""
         replica = self._replica
         rows = max(0, self._known.row - (replica.merged if replica else 0))
         return rows, time.monotonic() - self._complete_s
@@ -103,7 +103,7 @@ class Following:
         self._close_reader()
 
     def turn(self, timeout_s: float) -> None:
-        """Wait for news up to a timeout and apply it; a problem is logged once."""
+        """Wait for news up to a timeout and apply it; log a problem once."""
         if (left_s := self._again_s - time.monotonic()) > 0:
             self._ending.wait(min(left_s, timeout_s))
             return
@@ -113,7 +113,7 @@ class Following:
             complete_s = reader.complete_s()  # asked first, so the state is not older
             self._look(reader, reader.state(), complete_s)
             self._problem, self._pause_s = "", PAUSE_S
-        except (StoreError, OSError) as error:  # the database is away, for example during a promotion, or damaged
+        except (StoreError, OSError) as error:  # the database is away, as during a promotion, or damaged
             if isinstance(error, UnfitError):
                 self.ended = str(error)
             elif str(error) != self._problem:
@@ -131,7 +131,7 @@ class Following:
                 self.ended = "the follower has failed; its log says why"
 
     def _opened(self) -> JournalReader:
-        """The reader, reopened now and then; UnfitError for another site's journal."""
+        """The reader, reopened now and then; UnfitError for another site."""
         if time.monotonic() >= self._reopen_s:
             self._close_reader()
         if self._reader is None:
@@ -172,7 +172,7 @@ class Following:
             raise problem
 
     def _forget(self) -> None:
-        """Drop the map; queries fail until there is another."""
+        """Drop the map; queries fail until the next."""
         with self._lock:
             self._replica, self._is_whole = None, False
         self._complete_s, self._anew = float("-inf"), None
@@ -180,7 +180,7 @@ class Following:
         self.waits.advance(0)
 
     def _begun(self, reader: JournalReader) -> Replica:
-        """A replica from the newest valid snapshot or checkpoint, or empty."""
+        """A replica from the newest valid checkpoint, or empty."""
         replica = Replica(self.site, self.config, Tail(reader, self.past.archive))
         self._hear(reader, replica)
         if made := begun(self.past, reader, replica.wanted, self._ending.is_set):
@@ -206,17 +206,17 @@ class Following:
                 return
 
     def _fold_long(self, reader: JournalReader, replica: Replica, until: int) -> None:
-        """Fold all readable rows, before anybody is answered."""
+        """Fold all readable rows before answering."""
         facts = replica.facts
         rows = (some.without(facts.excluded) for some in replica.tail.rows(reader, until))
         if fold_samples(replica.grid, pieces(rows, Selection.by(facts)), self._ending.is_set):
             replica.adopt(replica.grid, replica.tail.row, facts)
-            # The site's now is that of merged rows; watermarks cover these and some that follow.
+            # The site's now is that of merged rows; watermarks include some that follow.
             replica.reach((machine, mark.newest_ns) for (machine, _), mark in reader.watermarks().items())
             release_memory()
 
     def _correct(self, reader: JournalReader, replica: Replica) -> None:
-        """Follow decisions: another grid is folded in parallel, and swapped in once it has all rows."""
+        """Follow decisions: fold another grid beside, and swap once it has all rows."""
         if self._anew is None:
             if replica.wanted != replica.facts:
                 facts = replica.wanted

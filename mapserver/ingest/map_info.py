@@ -50,9 +50,9 @@ def map_info(
 
 
 def name_shortfalls(journal: Journal, snapshot_rows: Sequence[int]) -> list[Shortfall]:
-    """Log acknowledged samples missing from a newly opened journal; returns all shortfalls ever.
+    """Log acknowledged samples missing from a new journal; returns all shortfalls ever.
 
-    snapshot_rows: of its snapshots; one beyond the journal proves a loss.
+    snapshot_rows: one beyond the journal proves a loss.
     """
     shortfall, newest = journal.shortfall, max(snapshot_rows, default=0)
     if newest > max(journal.last_row, shortfall.expected_row if shortfall else 0):
@@ -64,9 +64,9 @@ def name_shortfalls(journal: Journal, snapshot_rows: Sequence[int]) -> list[Shor
 
 
 def lacking(location: JournalLocation) -> Shortfall | None:
-    """The journal's shortfall, until a server start logs it; StoreError if unreadable.
+    """The journal's shortfall until a server start logs it; StoreError if unreadable.
 
-    The journal may be in use: evidence of its length is read first, so it is never ahead.
+    Evidence of its length is read first, so a journal in use is never behind it.
     """
     newest = max(snapshot_rows(location.folder), default=0)
     traces = location.traces(in_use=is_in_use(location.folder))

@@ -27,17 +27,14 @@ class MergeWaits:
     def __init__(self, merged: int) -> None:
         self._merged = merged
         self._waiting: list[_Wait] = []
-        self._next_row: float = float("inf")  # lowest awaited
+        self._next_row: float = float("inf")  # lowest awaited row
         self._closed = False
         self._news = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="waits", daemon=True)
         self._thread.start()
 
     def add(self, row: int, wait_s: float, then: Then) -> None:
-        """Call `then` once the row is merged (at once, if it is), or with an error after wait_s.
-
-        QueryError if too many are waiting.
-        """
+        """Call `then` once the row is merged, maybe at once; with an error after wait_s. QueryError if overloaded."""
         with self._news:
             if is_waiting := row > self._merged:
                 if len(self._waiting) >= MOST_WAITING:
@@ -50,7 +47,7 @@ class MergeWaits:
             then(None)
 
     def advance(self, merged: int) -> None:
-        """Note merged rows. Only wakes the calling thread, because the store's owner has no time."""
+        """Note merged rows. Only wakes the thread, because the store's owner has no time."""
         with self._news:
             self._merged = merged
             if merged >= self._next_row:

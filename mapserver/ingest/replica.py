@@ -1,6 +1,6 @@
-"""A store's map in a process that reads its journal: grid, facts and events so far.
+"""A store's map in a process that reads its journal: grid, facts and events.
 
-No clock, thread or file: data is passed in. For equal rows and facts the grid equals the server's, bit for bit.
+No clock, thread or file. For equal rows and facts the grid equals the server's, bit for bit.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class Replica:
         return max(shown, default=0)
 
     def machines(self) -> Collection[str]:
-        """Names of all machines that have sent samples."""
+        """Names of machines that have sent samples."""
         return self._newest_ns.keys()
 
     @property
     def wanted(self) -> Facts:
-        """Facts of all decisions; if they differ from `facts`, the grid must be rebuilt."""
+        """Facts of all decisions; the grid must be rebuilt if its facts differ."""
         return self._decisions.facts
 
     def hear(self, events: Sequence[Event], where: str) -> None:

@@ -1,4 +1,4 @@
-"""A replica that follows another server's journal and may be promoted: a warm standby."""
+"""A replica that follows another server's journal, for a warm take-over."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Standby(Following):
     def __init__(
         self, location: JournalLocation, site: SiteConfig, config: ServerConfig, check: Callable[[bool], object]
     ) -> None:
-        """check: called before each wait with whether the grid is warm; its exceptions end the wait."""
+        """check: called before waits, with whether the grid is warm; its exceptions end them."""
         super().__init__(location, site, config)
         self._check = check
 
@@ -35,7 +35,7 @@ class Standby(Following):
         return self._replica is not None and self._replica.merged > 0 and self._replica.tail.is_in(journal)
 
     def grid_for(self, journal: JournalQueries, facts: Facts) -> tuple[int, Grid] | None:
-        """The grid and its last row, if they match the journal and these facts."""
+        """The grid and its last row, if they match journal and facts."""
         if self._anew and self._anew[0] == facts:  # ahead of any other
             wait([self._anew[1]])
             self.turn(0.0)

@@ -52,8 +52,8 @@ class Incoming:
 class Store:
     """Journal, grid, watermarks and counters of one site.
 
-    identity: of this store; accepted: ids of stores it replaces. facts: of the grid; merged: its last journal row.
-    newest_ns: the site's now.
+    identity: of this store; accepted: ids it replaces. facts, merged: of the grid, its last row. newest_ns: the site's
+    now.
     """
 
     def __init__(
@@ -65,10 +65,7 @@ class Store:
         verify: Verify | None = None,
         standby: Standby | None = None,
     ) -> None:
-        """verify: raises MessageError unless the machine signed a batch.
-
-        standby: follows a shared journal while another server writes it.
-        """
+        """verify: raises MessageError unless a batch is signed. standby: follows a shared journal until take-over."""
         folder = location.folder
         self.site, self.config, self.location, self.now_ns = site, config, location, now_ns
         self._verify = verify
@@ -95,7 +92,7 @@ class Store:
             self._credit = self._new_credit()
             self.merged, counts = last_row, self.grid.counts()
             tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
-            self._snapshot_samples = 0 if warm else self.journal.samples - tail  # a warm grid is not on disk yet
+            self._snapshot_samples = 0 if warm else self.journal.samples - tail  # a warm grid is on no disk yet
             self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
             self._received_ns = self._last_received(last_row)
             self._opened = opened.pop_all()
@@ -128,7 +125,7 @@ class Store:
     def commit(self, group: list[Incoming]) -> list[Ack | Refused]:
         """Journal a group of batches in one commit, fold it, and return the answers.
 
-        Nothing is acknowledged before its commit; if the commit fails, all are refused.
+        Acknowledged after the commit; if it fails, all are refused.
         """
         batches = self._decode(group)
         try:
@@ -172,7 +169,7 @@ class Store:
     def adopt(self, grid: Grid, row: int, facts: Facts) -> None:
         """Continue with a grid folded elsewhere, with these facts, up to a row.
 
-        Later rows are folded here while batches wait, so they should be few.
+        Batches wait while later rows are folded, so let them be few.
         """
         grid.touch_all()
         selection = Selection.by(facts)
@@ -192,11 +189,11 @@ class Store:
         return self._decisions.facts
 
     def confirm(self, confirmed: Mapping[str, int]) -> None:
-        """Date what is offered to machines: the solver confirms it, as of when [ns]."""
+        """Date offers to machines: the solver confirms them, as of when [ns]."""
         self._decisions.calibration.confirm(confirmed)
 
     def accept(self, store: str, reason: str) -> None:
-        """Replace another store for good, by a person's decision: its runs continue here."""
+        """Replace another store for good, as a person says; its runs continue here."""
         if store != self.identity.id and store not in self.accepted:
             self.journal.append_event(ACCEPTED, self.newest_ns, {"store": store, "reason": reason})
             self.accepted |= {store}
@@ -275,7 +272,7 @@ class Store:
         return max((row.received_ns for row in self.journal.read(after=last_row - 1)), default=0) if is_there else 0
 
     def _new_credit(self) -> BlockCredit:
-        """Accounts for the present map; forgets what a failed commit spent."""
+        """Accounts for the present map, without what a failed commit spent."""
         return BlockCredit(self.site.cell_m, self.config.fold, self.grid.folded_since(-1)[0])
 
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:

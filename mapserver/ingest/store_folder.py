@@ -1,4 +1,4 @@
-"""Locks of folders: one server per store on a host, and one process that creates a folder."""
+"""Locks of folders: one server per store and host, one process per new folder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def hold(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def hold_place(folder: Path) -> Iterator[None]:
-    """Keep other processes from creating the same folder, by a lock beside it.
+    """Keep others from creating the same folder, by a lock beside it.
 
     ConfigError if one does; StoreError if it cannot be written.
     """
@@ -52,7 +52,7 @@ def hold_place(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise StoreError(folder, f"cannot be written: {error.strerror or error}") from None
     with file:
-        # A process that just ended has unlinked its file, whose lock excludes nobody.
+        # a process that just ended has unlinked its file, whose lock excludes nobody
         if not _taken(file) or not _is_still(file, path):
             raise ConfigError(folder, "another process is at work there; wait for it, or choose another --out")
         try:

@@ -1,4 +1,4 @@
-"""The thread that owns the store: it commits and folds batches, then replies; other threads hand it work."""
+"""The thread that owns the store: commits batches, folds them, replies; others hand it work."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ Reply = Callable[[Ack | Refused], None]
 _Batch = tuple[Incoming, Reply]
 log = logging.getLogger("mapserver.ingest.writer")
 
-COMMIT_EVERY_S = 0.01  # least interval of commits, because each costs a sync, some pages and 0.5 ms
-HANGS_S = 30.0  # longest piece of work: normal ones take less than a second, a broken disk for ever
+COMMIT_EVERY_S = 0.01  # least between commits, each of which costs a sync, pages and 0.5 ms
+HANGS_S = 30.0  # at one piece of work: a normal one takes less than a second
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class _Work:
 class Writer:
     """Owns a Store on its own thread; site, config, location, now_ns, store_id: of the store.
 
-    `submit`, `run` and `look` are thread-safe. waits: for merged rows.
+    `submit`, `run`, `look` are thread-safe. waits: for merged rows.
     """
 
     def __init__(self, store: Store, clock: Callable[[], float] = time.monotonic) -> None:
@@ -49,8 +49,8 @@ class Writer:
         self.site, self.config, self.location, self.now_ns = store.site, store.config, store.location, store.now_ns
         self.store_id = store.identity.id
         self._store, self._clock = store, clock
-        self._owned = threading.Lock()  # the store; its thread releases it while it waits
-        self._turn = threading.Condition()  # guards all that waits
+        self._owned = threading.Lock()  # the store, released while its thread waits
+        self._turn = threading.Condition()  # guards waiting batches and work
         self._backlog: Backlog[_Batch] = Backlog()
         self._group: list[_Batch] = []  # this turn's unanswered batches
         self._works: deque[_Work] = deque()
@@ -90,7 +90,7 @@ class Writer:
             overloaded(Refused(Refusal.OVERLOADED, problem, retry_after_s=retry_after_s))
 
     def run(self, work: Callable[[Store], T], timeout_s: float = 60.0) -> T:
-        """Run `work` on the owner's thread between groups, and return its result."""
+        """Run `work` on the owner's thread, between groups."""
         result: Future[T] = Future()
         with self._turn:
             if self._ended:
@@ -100,10 +100,7 @@ class Writer:
         return result.result(timeout_s)
 
     def look(self, work: Callable[[Store], T]) -> T:
-        """As `run`, for reads of the map, on the calling thread while the owner is idle.
-
-        This saves a change of threads; otherwise it queues.
-        """
+        """As `run`, for reads of the map: on the calling thread while the owner is idle."""
         if not (self._backlog or self._works) and self._owned.acquire(blocking=False):
             try:
                 if not self._ended:
@@ -151,7 +148,7 @@ class Writer:
             self._own()
 
     def _own(self) -> None:
-        """A bug must end the process: a server that accepts nothing is worse than none."""
+        """A bug must end the process: a server that accepts nothing is worse."""
         try:
             self._serve()
         except FencedError as error:
@@ -208,7 +205,7 @@ class Writer:
             self._owned.acquire()
 
     def _gather(self) -> bool:
-        """Wait for more batches if the last commit is recent; True if work comes first."""
+        """Wait for more batches after a recent commit; True if work comes first."""
         wait_s = self._committed_s + COMMIT_EVERY_S - self._clock()
         came = wait_s > 0 and self._turn.wait_for(lambda: self._works or self._is_closing, wait_s)
         return bool(came) and not self._is_closing
@@ -227,7 +224,7 @@ class Writer:
     def _save_snapshot(self) -> None:
         try:
             self._store.save_snapshot()
-        except OSError as error:  # the journal is the truth; without a snapshot only the next start takes longer
+        except OSError as error:  # the journal is the truth; only the next start takes longer
             log.error("snapshot failed error=%r", str(error))
         except Exception:  # a bug must be visible
             log.exception("snapshot failed")

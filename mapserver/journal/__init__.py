@@ -1,1 +1,1 @@
-"""What machines sent, on disk: the journal, its archive, and both read as one history."""
+"""What machines sent, on disk: the journal, its archive, and both as one history."""

@@ -1,8 +1,7 @@
-"""The archive: journal rows that are old enough, in one Parquet file per hour of reception (docs/operation.md).
+"""The archive: old journal rows, a Parquet file per hour of reception (docs/operation.md).
 
-A file is made under a temporary name, synced, renamed, and read back; only then does the journal forget its rows. A
-crash at any point leaves either a temporary file, which is removed, or a file whose rows the journal still has: it is
-compared with them, and they are forgotten then.
+A file is written under a temporary name, synced, renamed and read back; then the journal forgets its rows. After a
+crash a temporary file is removed, a complete one compared with the journal first.
 """
 
 from __future__ import annotations
@@ -26,38 +25,38 @@ from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 from protocol.units import HOUR_NS
 
-FOLDER = "archive"  # in the folder of a store
-FILE_SAMPLES = 2_000_000  # about; an hour with more is cut into several files
-GROUP_SAMPLES = 50_000  # of a row group, about: a batch is never cut
+FOLDER = "archive"  # in a store's folder
+FILE_SAMPLES = 2_000_000  # approximate; a busier hour is split
+GROUP_SAMPLES = 50_000  # approximate, per row group; batches are never cut
 TEMPORARY = "next.parquet.tmp"
-READABLE = 0o640  # its files never change and are for other programs too: their users come into its owner's group
-ReceivedRow = tuple[JournalRow, int]  # and when it came in [ns]
+READABLE = 0o640  # other programs read files by the owner's group; files never change
+ReceivedRow = tuple[JournalRow, int]  # with time of reception [ns]
 
 
 class Archive:
-    """The files of one store's archive, in the order of their rows. Any thread may read it."""
+    """The files of one store's archive, by rows. Thread-safe."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._opened: dict[Path, ArchiveFile] = {}
 
     def paths(self) -> list[Path]:
-        """All files, by their names."""
+        """All files, sorted by row."""
         return sorted((p for p in self.folder.glob("*.parquet") if NAME.fullmatch(p.name)), key=row_range)
 
     def open(self, path: Path) -> ArchiveFile:
-        """Open a file, or reuse one that is open: files never change."""
+        """Open a file, or reuse it: files never change."""
         if path not in self._opened:
             self._opened[path] = ArchiveFile(path)
         return self._opened[path]
 
     def read_many(self, after: int, until: int, selection: Selection = ALL) -> Iterator[JournalRows]:
-        """Rows after < row <= until, many at a time; StoreError where a file is missing, or two hold the same row."""
+        """Rows after < row <= until, many at a time; StoreError for a missing file or a row in two files."""
         for path in self.cover(until, after):
             yield from self.open(path).read_many(after, until, selection)
 
     def cover(self, until: int, after: int = 0) -> Iterator[Path]:
-        """The files with rows after < row <= until; StoreError as soon as one is missing, or two hold the same row."""
+        """Files with rows after < row <= until; StoreError as soon as one is missing, or a row is in two."""
         reached = after
         for path in self.paths():
             first, last = row_range(path)
@@ -74,7 +73,7 @@ class Archive:
             raise StoreError(self.folder, problem)
 
     def next_stamp(self, from_ns: int) -> int | None:
-        """The least stamp from `from_ns` on of all files; None for none."""
+        """The least stamp since from_ns in all files, or None."""
         stamps = (self.open(path).next_stamp(from_ns) for path in self.paths())
         return min((stamp for stamp in stamps if stamp is not None), default=None)
 
@@ -87,11 +86,10 @@ def archive(
     forget: Callable[[int], int],
     now_ns: int = LAST,
 ) -> Iterator[Path]:
-    """Move hours of reception that ended before `before_ns` from the journal into files, one at each step.
+    """Move hours of reception that ended before `before_ns` into files, one per step, on any thread.
 
-    Runs on any thread with a reader of its own. forget: is handed a row and has the journal's owner call
-    `Journal.forget` with it once, in between other work; returns what that returned. now_ns: the clock; a row that was
-    received later than that is as old as the next one that was not.
+    forget: has the journal's owner call `Journal.forget` once, and returns its result. now_ns: the clock; rows received
+    later count as received with the next valid one.
     """
     while path := next_file(folder, journal, site, before_ns, now_ns):
         _, last = row_range(path)
@@ -103,11 +101,8 @@ def archive(
 def next_file(
     folder: Path, journal: JournalReader, site: SiteConfig, before_ns: int, now_ns: int = LAST
 ) -> Path | None:
-    """Make the next file, or take the one that a crash left; the journal, compared with it, may forget its rows.
-
-    None where no further hour is old enough.
-    """
-    for unfinished in (folder / TEMPORARY, *folder.glob(f".{TEMPORARY}.*")):  # of a process that was killed
+    """Write the next file, or take one left by a crash, whose rows the journal may forget; None if no hour is due."""
+    for unfinished in (folder / TEMPORARY, *folder.glob(f".{TEMPORARY}.*")):  # of a killed process
         unfinished.unlink(missing_ok=True)
     archived = journal.archived_row
     left = [path for path in Archive(folder).paths() if row_range(path)[1] > archived]
@@ -119,9 +114,9 @@ def next_file(
 
 
 def _received(journal: JournalReader, after: int, now_ns: int) -> Iterator[ReceivedRow]:
-    """Rows and when they came in: where the server's clock was ahead of now then, when the next row did.
+    """Rows and times of reception; later ones than now_ns take the next row's.
 
-    Otherwise one row that was received "next year" would keep all that follow from the archive until then.
+    A row received "next year" would block the archive until then.
     """
     until, known_ns = 0, 0
     for row in journal.read(after):
@@ -134,7 +129,7 @@ def _received(journal: JournalReader, after: int, now_ns: int) -> Iterator[Recei
 
 
 def _next_received(journal: JournalReader, after: int, now_ns: int) -> tuple[int, int]:
-    """The next row that was received by now, and when; where there is none, LAST and now."""
+    """The next row received by now, and when; LAST and now for none."""
     for rows in journal.read_many(after):
         if len(there := np.flatnonzero(rows.received_ns <= now_ns)):
             return int(rows.numbers[there[0]]), int(rows.received_ns[there[0]])
@@ -142,7 +137,7 @@ def _next_received(journal: JournalReader, after: int, now_ns: int) -> tuple[int
 
 
 def _hour(rows: Iterator[ReceivedRow], before_ns: int) -> Iterator[ReceivedRow]:
-    """Rows that were received in the same hour as the first one, if that ended before `before_ns`."""
+    """Rows of the first row's hour, if it ended before `before_ns`."""
     hour, samples = None, 0
     for row, received_ns in rows:
         hour = received_ns // HOUR_NS if hour is None else hour
@@ -153,7 +148,7 @@ def _hour(rows: Iterator[ReceivedRow], before_ns: int) -> Iterator[ReceivedRow]:
 
 
 def _compare(path: Path, journal: JournalReader, archived: int) -> None:
-    """Make sure that a file holds, to the bit, the rows that the journal would forget."""
+    """Require that a file equals, to the bit, the rows that the journal would forget."""
     _, last = row_range(path)
     for one, other in zip_longest(ArchiveFile(path).read(archived), journal.read(archived, last)):
         if one is None or other is None or _plain(one) != _plain(other):
@@ -167,9 +162,9 @@ def _plain(row: JournalRow) -> tuple[object, ...]:
 
 
 def write_file(folder: Path, store: str, site: SiteConfig, rows: Iterator[ReceivedRow]) -> Path | None:
-    """Write rows of a store to a new file that survives a power cut once it has its name; None where there are none.
+    """Write rows to a durable file; None without rows.
 
-    The file is complete under a temporary name first: its own name has its last row, which is not known before.
+    Under a temporary name first, as its own contains the last row.
     """
     begin = next(rows, None)
     if begin is None:
@@ -192,13 +187,13 @@ def write_file(folder: Path, store: str, site: SiteConfig, rows: Iterator[Receiv
 
 
 def file_name(received_ns: int, first_row: int, last_row: int) -> str:
-    """Name of a file: hour of reception (UTC), first and last row."""
+    """Hour of reception (UTC), first and last row."""
     hour = datetime.fromtimestamp(received_ns // HOUR_NS * 3600, UTC).strftime("%Y-%m-%dT%H")
     return f"{hour}_{first_row:06d}-{last_row:06d}.parquet"
 
 
 def write_parquet(file: BinaryIO, store: str, site: SiteConfig, rows: Iterator[JournalRow]) -> int:
-    """Write rows, row group by row group; returns the last one's number."""
+    """Write rows in row groups; returns the last number."""
     with ArchiveWriter(file, store, site) as writer:
         for group in _groups(rows):
             writer.add(JournalRows.joined(group))
@@ -206,9 +201,9 @@ def write_parquet(file: BinaryIO, store: str, site: SiteConfig, rows: Iterator[J
 
 
 class ArchiveWriter:
-    """Writes the rows of a file in row groups of about GROUP_SAMPLES; use it as a context, then `seal` the file.
+    """Writes a file in row groups of about GROUP_SAMPLES; use it as a context, then `seal` the file.
 
-    store, site: what the file states about its rows.
+    store, site: stated in the file.
     """
 
     def __init__(self, file: BinaryIO, store: str, site: SiteConfig) -> None:
@@ -218,7 +213,7 @@ class ArchiveWriter:
         self._parquet = arrow("parquet").ParquetWriter(file, _schema(), **_options())
 
     def add(self, rows: JournalRows) -> None:
-        """Write rows; a batch is never cut."""
+        """Write rows; batches are never cut."""
         self._machines |= {rows.machines[number] for number in np.unique(rows.machine).tolist()}
         self._waiting.append(_table(rows))
         if sum(table.num_rows for table in self._waiting) >= GROUP_SAMPLES:
@@ -246,7 +241,7 @@ def _options() -> dict[str, Any]:
     return {
         "compression": "zstd",
         "use_dictionary": ["machine", "spool_id", "received_ns"],
-        # Never a dictionary for samples: it would take every NaN for the same. Split by byte they also shrink better.
+        # No dictionary for samples, which merges all NaN; split bytes also compress better.
         "column_encoding": dict.fromkeys(COLUMNS, "BYTE_STREAM_SPLIT") | delta,
         "write_page_checksum": True,
         "write_page_index": True,
@@ -254,7 +249,6 @@ def _options() -> dict[str, Any]:
 
 
 def _groups(rows: Iterator[JournalRow]) -> Iterator[list[JournalRow]]:
-    """Batches of one row group each."""
     group: list[JournalRow] = []
     samples = 0
     for row in rows:

@@ -1,8 +1,8 @@
-"""One file of the archive: its columns and metadata, the seal that finds any damage, and how it is read.
+"""An archive file: columns, metadata, a seal that reveals damage, and reading.
 
-Parquet's page checksums leave out the headers of pages and the footer, whose statistics decide what is skipped. So 12
-bytes before the footer, where readers of Parquet never look, hold the CRC-32 of all that is before them and of all that
-is behind them. Anybody can make such a seal: what is decoded is checked as samples of a machine are.
+Parquet's checksums omit page headers and the footer, whose statistics decide what is skipped. Hence 12 bytes before the
+footer, ignored by Parquet readers, with CRC-32 of all before and after. Seals can be forged, so samples are checked
+like a machine's.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from protocol.site.site_config import NAME as MACHINE_NAME
 from protocol.wire.codec import MAX_SEQ
 
 SCHEMA = 6
-KEY = b"sitegrid"  # of our own metadata
+KEY = b"sitegrid"  # of our metadata
 NAME = re.compile(r"\d{4}-\d\d-\d\dT\d\d_(\d+)-(\d+)\.parquet")
-_IDENTITY = ["machine", "row", "spool_id", "seq", "received_ns"]  # columns beside those of samples
-_RANGED = ("row", "received_ns", "stamp_ns", "x_m", "y_m")  # columns whose ranges Parquet's statistics state
-MAX_GROUP = 2**20  # samples of a row group: a small file can claim any number
+_IDENTITY = ["machine", "row", "spool_id", "seq", "received_ns"]  # columns besides samples
+_RANGED = ("row", "received_ns", "stamp_ns", "x_m", "y_m")  # columns with ranges in Parquet's statistics
+MAX_GROUP = 2**20  # samples per row group; small files can claim any number
 _SEAL = b"SGRD"
 _SEAL_BYTES = 12
 
 
 @dataclass(frozen=True)
 class ArchiveHeader:
-    """What a file states about itself beside Parquet's own metadata. store: id of the store that it is of."""
+    """What a file states about itself. store: id of its store."""
 
     store: str
     site: SiteConfig
@@ -55,7 +55,7 @@ class ArchiveHeader:
 
 @dataclass(frozen=True)
 class _Spans:
-    """Rows, stamps and bounding boxes of row groups or of batches, each (n,)."""
+    """Rows, stamps and bounding boxes of row groups or batches, (n,) each."""
 
     first_row: Ints
     last_row: Ints
@@ -67,7 +67,7 @@ class _Spans:
     north_m: AnyArray
 
     def may_hold(self, after: int, until: int, selection: Selection) -> Bools:
-        """Which of them, (n,), may hold selected samples; machines are not compared."""
+        """Which (n,) may hold selected samples, whatever the machine."""
         overlaps = (self.last_row > after) & (self.first_row <= until)
         overlaps &= (self.last_ns >= selection.from_ns) & (self.first_ns <= selection.to_ns)
         if place := selection.bounds:
@@ -77,10 +77,9 @@ class _Spans:
 
 
 class ArchiveFile:
-    """One file of an archive. StoreError, with its name, where it is damaged or no file of an archive.
+    """An archive file; StoreError if damaged or foreign.
 
-    first_row, last_row, samples, first_received_ns: of the whole file. identity: hex digits, which other contents do
-    not have.
+    first_row, last_row, samples, first_received_ns: of the file. identity: hex digits unique to its content.
     """
 
     def __init__(self, path: Path | FilePlace) -> None:
@@ -100,16 +99,13 @@ class ArchiveFile:
             raise StoreError(path, f"holds the rows {self.first_row} to {self.last_row}; give it back its name")
 
     def read(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRow]:
-        """Journal rows exactly as they were, in order; selected as by `JournalReader.read`."""
+        """Rows as journalled, in order; see `JournalReader.read`."""
         return chain.from_iterable(self.read_many(after, until, selection))
 
     def read_many(
         self, after: int = 0, until: int = LAST, selection: Selection = ALL, columns: Sequence[str] = COLUMNS
     ) -> Iterator[JournalRows]:
-        """As `read`, many at a time.
-
-        columns: of samples; the others are zero. `stamp_ns`, `x_m` and `y_m` are among them.
-        """
+        """As `read`, many at a time. columns: of samples, with `stamp_ns`, `x_m` and `y_m`; others are zero."""
         groups = np.flatnonzero(self._groups.may_hold(after, until, selection)).tolist()
         if not groups or selection.without.issuperset(self.header.machines):
             return
@@ -123,7 +119,7 @@ class ArchiveFile:
                 yield rows
 
     def _check(self, group: int, columns: Mapping[str, AnyArray], table: Any) -> None:
-        """Raise ValueError unless a row group holds batches, one behind the other, of samples that are plausible."""
+        """ValueError unless a row group holds consecutive batches of plausible samples in the stated ranges."""
         check_samples({name: values for name, values in columns.items() if name in COLUMNS}, MAX_EXTENT_M)
         for name in _RANGED:
             if (columns[name].min(), columns[name].max()) != (self._low[name][group], self._high[name][group]):
@@ -134,7 +130,7 @@ class ArchiveFile:
         ahead = np.diff(columns["row"])
         if ahead.min(initial=0) < 0 or not 1 <= columns["seq"].min() <= columns["seq"].max() <= MAX_SEQ:
             raise ValueError("rows or sequence numbers are not in order")
-        inside = ahead == 0  # pairs of samples of one batch
+        inside = ahead == 0  # sample pairs within a batch
         same = (columns["spool_id"], columns["received_ns"], names.indices.to_numpy())
         if (
             any((values[1:] != values[:-1])[inside].any() for values in same)
@@ -143,7 +139,7 @@ class ArchiveFile:
             raise ValueError("a row is no batch of one machine")
 
     def next_stamp(self, from_ns: int) -> int | None:
-        """The least stamp from `from_ns` on; None for none. Only row groups that reach across it are read."""
+        """The least stamp since from_ns, or None. Reads only row groups that span it."""
         first_ns = self._groups.first_ns
         stamps = first_ns[first_ns >= from_ns].tolist()
         for rows in self.read_many(selection=Selection(from_ns=from_ns, to_ns=min(stamps, default=LAST) - 1)):
@@ -153,13 +149,13 @@ class ArchiveFile:
 
 
 def row_range(path: Path | FilePlace) -> tuple[int, int]:
-    """First and last journal row of a file, by its name."""
+    """First and last row in a file's name."""
     first, last = path.stem.partition("_")[2].split("-")
     return int(first), int(last)
 
 
 def _rows(table: Any, of_samples: Sequence[str], after: int, until: int, selection: Selection) -> JournalRows:
-    """The selected journal rows of a row group."""
+    """Selected rows of a row group."""
     samples: Table = np.zeros(table.num_rows, SAMPLE_DTYPE)
     for name in of_samples:
         samples[name] = table.column(name).to_numpy()
@@ -178,7 +174,7 @@ def _rows(table: Any, of_samples: Sequence[str], after: int, until: int, selecti
 
 
 def _statistics(metadata: Any) -> tuple[dict[str, AnyArray], dict[str, AnyArray]]:
-    """Smallest and largest values of the columns of each row group, each (groups,)."""
+    """Minima and maxima of columns, (groups,) each."""
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     if not groups or any(not 0 < group.num_rows <= MAX_GROUP for group in groups):
         raise ValueError("it has no samples, or too many at once")
@@ -195,7 +191,7 @@ def _spans(low: dict[str, AnyArray], high: dict[str, AnyArray]) -> _Spans:
 
 
 def seal(file: BinaryIO) -> None:
-    """Move the footer of a new file behind its seal."""
+    """Insert the seal before a new file's footer."""
     file.seek(0)
     data = file.read()
     start = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
@@ -206,8 +202,8 @@ def seal(file: BinaryIO) -> None:
 
 
 def _tail(path: Path | FilePlace) -> bytes:
-    """Seal and footer, checked, without reading the rest."""
-    length = int.from_bytes(_read(path, 8)[:4], "little")  # of the footer alone
+    """Checked seal and footer, without the rest."""
+    length = int.from_bytes(_read(path, 8)[:4], "little")  # of the footer
     tail = _read(path, _SEAL_BYTES + length + 8)
     if tail[-4:] != b"PAR1" or tail[:4] != _SEAL:
         raise StoreError(path, "is damaged, or no file of a map server's archive; restore it from a backup")
@@ -217,7 +213,7 @@ def _tail(path: Path | FilePlace) -> bytes:
 
 
 def _checked(path: Path | FilePlace) -> bytes:
-    """All bytes of a file, read once, so that what is decoded is what was checked."""
+    """A whole file, read once, so that what is decoded is what was checked."""
     tail = _tail(path)
     data = _read(path)
     body = len(data) - len(tail)
@@ -228,7 +224,7 @@ def _checked(path: Path | FilePlace) -> bytes:
 
 @contextmanager
 def _described(path: Path | FilePlace) -> Iterator[None]:
-    """Whatever Parquet or a stranger's values can be wrong in, as one StoreError."""
+    """Turn any error of Parquet or of foreign values into a StoreError."""
     wrong = (arrow().ArrowException, OSError, ValueError, TypeError, LookupError, MessageError)
     try:
         yield
@@ -238,7 +234,7 @@ def _described(path: Path | FilePlace) -> Iterator[None]:
 
 
 def _check_schema(metadata: Any) -> None:
-    """Raise ValueError unless names and types of all columns are those of an archive."""
+    """ValueError unless columns and types are an archive's."""
     kinds = {"machine": "string", "spool_id": "uint64"} | dict.fromkeys(("seq", "row", "received_ns"), "int64")
     kinds |= {name: str(arrow().from_numpy_dtype(SAMPLE_DTYPE[name])) for name in COLUMNS}
     schema = metadata.schema.to_arrow_schema()
@@ -249,9 +245,9 @@ def _check_schema(metadata: Any) -> None:
 
 
 def _read(path: Path | FilePlace, last: int | None = None) -> bytes:
-    """The bytes of a file, or so many of its last ones."""
+    """A file's bytes, or its last ones."""
     if isinstance(path, Path) and path.exists() and not path.is_file():
-        raise StoreError(path, "is no regular file")  # a FIFO would be waited for
+        raise StoreError(path, "is no regular file")  # a FIFO would block
     try:
         with path.open("rb") as file:
             if last is not None:
@@ -273,7 +269,7 @@ def _header(path: Path | FilePlace, metadata: dict[bytes, bytes]) -> ArchiveHead
 
 
 def arrow(module: str = "") -> Any:
-    """Import pyarrow, or a module of it, where it is first needed: a server without an archive does without."""
+    """Import pyarrow, or a module of it, when needed."""
     try:
         return import_module(f"pyarrow.{module}" if module else "pyarrow")
     except ModuleNotFoundError:

@@ -1,6 +1,6 @@
-"""Decisions about calibration beside the files of an archive: who folds these files has the map that the server had.
+"""Calibration decisions beside archive files, so that folding these gives the server's map.
 
-The file is replaced as a whole; the journal, which is the truth, has the same decisions as events.
+Replaced as a whole; the journal has the same decisions as events and is the truth.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from mapserver.journal.places import FilePlace
 from protocol.errors import StoreError
 from protocol.files import write_whole
 
-FILE = "calibration.json"  # in the folder of an archive
+FILE = "calibration.json"  # in an archive's folder
 
 
 def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> None:
-    """Write the decisions of a store, in their order; raises StoreError."""
+    """Write a store's decisions, in order; raises StoreError."""
     table = {"store": store, "decisions": [decision.body() for decision in decisions]}
     text = json.dumps({**table, "crc32": _checksum(table)}, separators=(",", ":"))
     try:
@@ -31,7 +31,7 @@ def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> 
 
 
 def load(folder: Path | FilePlace) -> list[CalibrationDecision]:
-    """Read what `save` wrote, nothing where there is no file; StoreError for damage, or of another program."""
+    """Read what `save` wrote, empty without a file; StoreError for damage or foreign content."""
     path = folder / FILE
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -49,5 +49,4 @@ def load(folder: Path | FilePlace) -> list[CalibrationDecision]:
 
 
 def _checksum(table: dict[str, Any]) -> int:
-    """CRC-32 of all values and their names."""
     return zlib.crc32(json.dumps(table, sort_keys=True).encode())

@@ -1,4 +1,4 @@
-"""Facts: what a map depends on beside its samples, as decisions in the journal say it."""
+"""Facts: what a map depends on besides samples, by the journal's decisions."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from protocol.machine.readings import MAX_STAMP_NS
 
 @dataclass(frozen=True)
 class Facts:
-    """What counts about machines.
+    """Facts about machines.
 
-    excluded: machines whose samples are not in the map. corrections: what is taken off the others' samples. number: of
-    the last decision that is counted, 0 for none; facts are equal that make equal maps.
+    excluded: not in the map. corrections: of the other machines. number: of the last decision, 0 for none; not
+    compared, so facts are equal if maps are.
     """
 
     excluded: frozenset[str] = frozenset()
@@ -22,7 +22,7 @@ class Facts:
     number: int = field(default=0, compare=False)
 
     def of_evidence(self, before_ns: int = MAX_STAMP_NS) -> Mapping[str, object]:
-        """What evidence of samples stamped before a time depends on; it is made again where this is not the same."""
+        """Dependencies of evidence stamped before a time, which is rebuilt if they change."""
         return {"excluded": sorted(self.excluded), "corrections": self.corrections.digest(before_ns)}
 
 

@@ -1,7 +1,4 @@
-"""History: archive and journal as one; and long folds of it on several threads.
-
-A history is folded anew after a decision about a machine, and when a store is opened.
-"""
+"""History: archive and journal as one, folded on several threads."""
 
 from __future__ import annotations
 
@@ -26,23 +23,23 @@ from mapserver.journal.records import checksum_of, record
 from mapserver.journal.rows import ALL, LAST, JournalRow, JournalRows, Selection
 from protocol.arrays import Table
 
-# Kernels run beside each other, what is Python between them does not. Not more are tried: lab/results/refold.md
+# only kernels run in parallel; more do not help: lab/results/refold.md
 THREADS = min(2, len(os.sched_getaffinity(0)))
 PIECE = 16_384  # samples
-AHEAD = 24  # pieces that are read ahead: about as many as are folded at once, while nothing is taken
-Samples = tuple[Table, NDArray[np.uint64]]  # and the hashes of their machines' names
+AHEAD = 24  # pieces, about one fold's
+Samples = tuple[Table, NDArray[np.uint64]]  # with hashes of machine names
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class History:
-    """All rows of one store. Used by one thread at a time, as its journal's connection is."""
+    """All rows of one store. For one thread at a time, like its journal's connection."""
 
     journal: JournalQueries
     archive: Archive
 
     def row_checksum(self, row: int) -> int | None:
-        """As of a journal; of rows that were archived, too: those are the same, bit for bit."""
+        """As of a journal, also for archived rows, equal bit for bit."""
         if (checksum := self.journal.row_checksum(row)) is not None or not 0 < row <= self.journal.archived_row:
             return checksum
         return next((checksum_of(record(each)) for each in history_rows(self, row - 1, row)), None)
@@ -51,10 +48,7 @@ class History:
 def read_history(
     history: History, after: int = 0, until: int = LAST, selection: Selection = ALL
 ) -> Iterator[JournalRows]:
-    """Rows after < row <= until in order, from archive and journal, each once, also while rows move between them.
-
-    Many at a time, and never none.
-    """
+    """Rows after < row <= until in order, once each, even while they move to the archive; in non-empty pieces."""
     while True:
         try:
             for rows in history.journal.read_many(after, until, selection):
@@ -76,12 +70,12 @@ def history_rows(
 
 
 class _StoppedError(Exception):
-    """A fold is not wanted any more."""
+    """A fold was cancelled."""
 
 
 @contextmanager
 def lent(count: int) -> Iterator[Workers]:
-    """Lend so many threads to a grid (`Grid.bulk`)."""
+    """Lend threads to a grid (`Grid.bulk`)."""
     if count == 1:
         yield ALONE
         return
@@ -98,9 +92,9 @@ def fold_history(
     stopped: Callable[[], bool] = lambda: False,
     threads: int = THREADS,
 ) -> bool:
-    """Fold the selected samples of rows after < row <= until, and settle the grid.
+    """Fold selected samples of rows after < row <= until, and settle the grid.
 
-    Whether it came to the end: where `stopped` says so it ends early, and the grid is of no use.
+    Returns False, with an unusable grid, if `stopped`.
     """
     return fold_samples(grid, pieces(read_history(history, after, until, selection), selection), stopped, threads)
 
@@ -111,20 +105,20 @@ def fold_samples(
     stopped: Callable[[], bool] = lambda: False,
     threads: int = THREADS,
 ) -> bool:
-    """As `fold_history`, of any samples, piece by piece."""
+    """As `fold_history`, for any samples."""
     try:
         with lent(threads) as workers, grid.bulk(workers), closing(ahead(pieces) if threads > 1 else pieces) as coming:
             for samples, names in coming:
                 grid.fold_all(samples, names)
                 if stopped():
-                    raise _StoppedError  # past what ends a fold in order, which takes its time
+                    raise _StoppedError  # skips the regular end, which takes time
     except _StoppedError:
         return False
     return True
 
 
 def ahead(pieces: Iterator[T]) -> Generator[T, None, None]:
-    """Have the next pieces made on another thread while one is used."""
+    """Make pieces ahead on another thread."""
     with ThreadPoolExecutor(1, thread_name_prefix="read") as pool:
         try:
             coming = deque(pool.submit(next, pieces, None) for _ in range(AHEAD))
@@ -136,7 +130,7 @@ def ahead(pieces: Iterator[T]) -> Generator[T, None, None]:
 
 
 def pieces(history: Iterable[JournalRows], selection: Selection) -> Generator[Samples, None, None]:
-    """Samples of rows in pieces, none of them long, so that those read ahead take little memory."""
+    """Samples in short pieces, to save memory on those read ahead."""
     for rows in history:
         samples, names = rows.selected(selection)
         for first in range(0, len(samples), PIECE):
@@ -144,6 +138,6 @@ def pieces(history: Iterable[JournalRows], selection: Selection) -> Generator[Sa
 
 
 def release_memory() -> None:
-    """Give back to the system what a long fold has freed: the C library would keep it, for each thread apart."""
-    with suppress(OSError, AttributeError):  # glibc has it
+    """Return memory freed by a fold to the system; the C library keeps it per thread."""
+    with suppress(OSError, AttributeError):  # only glibc has it
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,8 +1,7 @@
-"""What a journal is, whatever keeps it: the seam between a map server and its database.
+"""The journal: the interface of a map server to its database.
 
-A journal holds what machines sent, in rows that are numbered 1, 2, 3... in the order of their commits, a watermark per
-spool, and events. One writer has it, any number of readers look. Nothing outside of the folders that implement this
-knows which database it is (`location.py` does), nor catches its errors: all are one of those here.
+It holds rows of samples, numbered 1, 2, 3... by commit, a watermark per spool, and events, for one writer and many
+readers. Only implementing folders and `location.py` know the database; its errors become those below.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from mapserver.journal.rows import (
 from mapserver.journal.shortfall import Shortfall
 from protocol.errors import StoreError
 
-ROWS_AT_ONCE = 200  # read or removed in one transaction: short ones hold nobody up
+ROWS_AT_ONCE = 200  # read or removed per transaction, kept short for others
 
 
 class ArchivedError(StoreError):
-    """Rows that are asked for have moved to the archive. archived_row: the last one that has."""
+    """Requested rows are in the archive. archived_row: the last archived one."""
 
     def __init__(self, where: object, archived_row: int) -> None:
         super().__init__(where, f"rows up to {archived_row} are in the archive beside it")
@@ -39,10 +38,9 @@ class ArchivedError(StoreError):
 
 
 class UnwrittenError(StoreError):
-    """A transaction failed, as on a full disk: after `rollback` the journal is as it is on disk, and goes on.
+    """A transaction failed, as on a full disk; after `rollback` the journal continues.
 
-    problem: what the database says, without where it is. unsure: it may have been committed all the same, since the
-    answer is lost.
+    problem: the database's message, without location. unsure: the answer was lost; it may be committed.
     """
 
     def __init__(self, where: object, problem: str, *, unsure: bool = False) -> None:
@@ -51,12 +49,12 @@ class UnwrittenError(StoreError):
 
 
 class FencedError(UnwrittenError):
-    """Another server has taken over the journal: this one acknowledges nothing any more, and ends."""
+    """Another server has taken over the journal; this one ends."""
 
 
 @dataclass(frozen=True)
 class JournalState:
-    """How far a journal is. epoch: number of its writer, each has a higher one; row, event: the last ones."""
+    """Progress of a journal. epoch: of its writer, ever higher; row, event: the last ones."""
 
     epoch: int
     row: int
@@ -64,11 +62,11 @@ class JournalState:
 
 
 class JournalQueries(Protocol):
-    """What can be read of a journal, by its writer as by a reader."""
+    """Queries of a journal, for its writer and readers."""
 
     @property
     def where(self) -> str:
-        """Where it is, for people."""
+        """Its location, for people."""
 
     @property
     def last_row(self) -> int:
@@ -76,24 +74,21 @@ class JournalQueries(Protocol):
 
     @property
     def archived_row(self) -> int:
-        """The last row that has moved to the archive."""
+        """The last archived row."""
 
     @property
     def schema(self) -> int:
-        """Number of its tables' form."""
+        """Schema number of its tables."""
 
     @property
     def replica(self) -> str:
-        """What stands behind the disk: "synchronous" where a commit waits for another machine's disk too.
-
-        "asynchronous" where another one follows without that, else "none".
-        """
+        """ "synchronous" if commits wait for another machine's disk too, "asynchronous" if one follows, else "none"."""
 
     def identity(self) -> StoreIdentity:
-        """Which store this is; StoreError where that is damaged."""
+        """The store's identity; StoreError if damaged."""
 
     def state(self) -> JournalState:
-        """How far it is now."""
+        """Present progress."""
 
     def watermarks(self) -> dict[SpoolKey, Watermark]:
         """Progress of all spools."""
@@ -102,62 +97,54 @@ class JournalQueries(Protocol):
         """As `read_many`, one by one."""
 
     def read_many(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRows]:
-        """Rows after < row <= until in order, also those that are committed meanwhile; many at a time, and never none.
+        """Rows after < row <= until in order, also new ones, in non-empty pieces.
 
-        StoreError where a row is missing or not what was written, after those before it; ArchivedError as soon as one
-        of them is archived.
+        StoreError at a missing or damaged row, after those before; ArchivedError as soon as one is archived.
         """
 
     def row_checksum(self, row: int) -> int | None:
-        """The checksum that a row was written with; None where it is not there, or archived.
-
-        Who has seen a row knows by this whether the journal still has it, or was restored and went another course.
-        """
+        """A row's checksum, by which readers notice that a journal has diverged; None if missing or archived."""
 
     def event_checksum(self, number: int) -> int | None:
-        """As `row_checksum`, of an event."""
+        """As `row_checksum`, for an event."""
 
     def events(self, kind: str | None = None, after: int = 0) -> list[Event]:
-        """Events beyond the number `after`, of one kind or of all, in the order in which they were written."""
+        """Events numbered above `after`, of one kind or all, in order."""
 
     def stamps_by_chunk(self, after: int, until: int, chunk: int) -> list[tuple[int, int, int]]:
-        """Chunks of so many rows among after < row <= until: number, least and greatest stamp of each."""
+        """Number, least and greatest stamp of each chunk of rows in after < row <= until."""
 
     def least_stamp(self, after: int, until: int, from_ns: int) -> int | None:
-        """The least stamp of rows after < row <= until, `from_ns` of a row that reaches across it; None for none."""
+        """The least stamp of rows after < row <= until, or from_ns if a row spans it; None for none."""
 
     def rows_before(self, after: int, until: int, stamp_ns: int) -> int:
-        """How many of the rows after < row <= until have a stamp before a time; of archived ones none is counted."""
+        """Number of unarchived rows after < row <= until with a stamp before a time."""
 
     def check(self) -> None:
-        """Check identity, extents, events and watermarks; StoreError where one is damaged.
+        """Check identity, extents, events and watermarks; StoreError for damage.
 
-        Rows are checked when they are read. A damaged extent would hide its row from a read by time and place, without
-        any error.
+        Rows are checked on reading, but a damaged extent would silently hide its row.
         """
 
     def close(self) -> None:
-        """Close it; nothing is asked of it from then on."""
+        """Close it."""
 
 
 class JournalReader(JournalQueries, Protocol):
-    """Reads a journal also while a server writes it; used by one thread at a time. site, frame: whose it is."""
+    """Reads a journal while a server may write it; for one thread at a time. site, frame: its own."""
 
     site: str
     frame: str
 
     def complete_s(self) -> float:
-        """When, by the steady clock, what can be read now was all that was journalled; negative infinity where unknown.
-
-        That is now, but where it is read from a replica of a database, which may be behind.
-        """
+        """Monotonic time at which the readable rows were complete: now, or earlier on a replica; -inf if unknown."""
 
     @property
     def is_replica(self) -> bool:
-        """Whether it reads from a replica of a database: the next connection may be to one that is further behind."""
+        """Whether it reads a database replica; the next one may lag further."""
 
     def follow(self, known: JournalState, timeout_s: float) -> JournalState:
-        """Wait until the journal is not as known any more, or for so long; returns how far it is then."""
+        """Wait for progress beyond `known`, or a timeout; returns the progress."""
 
     def __enter__(self) -> Self:
         """Use it."""
@@ -170,36 +157,36 @@ class Waiting(Protocol):
     """What a server does while another one writes its journal."""
 
     def follow(self, timeout_s: float) -> None:
-        """Do it for so long; what it raises ends the wait."""
+        """Do it for a while; exceptions end the wait."""
 
     def has_checked(self, journal: JournalQueries) -> bool:
-        """Whether that was done meanwhile which `JournalQueries.check` does, and need not be done again."""
+        """Whether it has already done the work of `JournalQueries.check`."""
 
 
 class Journal(JournalQueries, Protocol):
-    """One writer's connection to the journal of one site.
+    """The writer's connection to a journal.
 
-    Transactions: what fails raises UnwrittenError, and `rollback` is called then. shortfall: what was acknowledged and
-    was not in it when it was opened now, None where nothing is missing. samples: that all machines sent.
+    Failed transactions raise UnwrittenError; call `rollback` then. shortfall: data missing on opening, or None.
+    samples: of all machines.
     """
 
     shortfall: Shortfall | None
 
     @property
     def epoch(self) -> int:
-        """Its number among all writers of this journal, higher than that of those before."""
+        """Number of this writer; later ones have higher numbers."""
 
     @property
     def fenced(self) -> str:
-        """Why it may not write any more since another server does, empty while it may; for any thread."""
+        """Why another server has taken over, or ""; thread-safe."""
 
     @property
     def trusted_row(self) -> int:
-        """What the server's folder has of rows up to this one, snapshots and checkpoints, is of this journal."""
+        """Last row up to which snapshots and checkpoints in the server's folder belong to this journal."""
 
     @property
     def samples(self) -> int:
-        """How many samples all machines sent."""
+        """Samples sent by all machines."""
 
     def watermark(self, machine: str, spool_id: int) -> Watermark:
         """Progress of a spool."""
@@ -208,40 +195,34 @@ class Journal(JournalQueries, Protocol):
         """What each machine sent."""
 
     def begin(self) -> None:
-        """Open a transaction; rows appended from here on are one group commit.
-
-        There may be rows then that were committed though an error said otherwise, as the answer of a database was lost.
-        """
+        """Open a transaction, a group commit. Earlier rows may have been committed although the answer was lost."""
 
     def append(self, admission: Admission, received_ns: int) -> int:
-        """Write one row and its watermark into the open transaction; returns the row's number."""
+        """Write a row and its watermark into the open transaction; returns its number."""
 
     def declare_lost(self, admission: Admission) -> None:
-        """Write a watermark alone into the open transaction: samples at a spool's end that will never come."""
+        """Write only a watermark: samples at a spool's end are lost."""
 
     def commit(self) -> None:
-        """Commit to disk; only then may anything be acknowledged."""
+        """Commit to disk, before anything is acknowledged."""
 
     def rollback(self) -> None:
-        """Give up the open transaction, if there is one, and return to what is on disk."""
+        """Abort any open transaction and return to what is on disk."""
 
     def append_event(self, kind: str, stamp_ns: int, body: Mapping[str, Any]) -> int:
-        """Commit an event, outside of any other transaction; returns its number."""
+        """Commit an event, outside of transactions; returns its number."""
 
     def append_events(self, events: Iterable[tuple[str, int, Mapping[str, Any]]]) -> int:
-        """Commit events (kind, stamp_ns, body), all or none, outside of other transactions; returns the last number.
-
-        The number is 0 where there never was an event.
-        """
+        """Commit events (kind, stamp_ns, body), all or none, outside of transactions; returns the last number, or 0."""
 
     def note_shortfall(self, shortfall: Shortfall) -> None:
-        """Keep what is missing as an event; no file that proves it is needed from then on."""
+        """Store missing data as an event, in place of files that prove it."""
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
-        """Remove the next rows up to `until`, which are archived, and commit; returns the new `archived_row`.
+        """Remove archived rows up to `until` and commit; returns the new `archived_row`.
 
-        most: how many at most, so that batches need not wait long; call it again until `until` is reached.
+        At most `most`, so that batches need not wait; repeat until `until`.
         """
 
     def shrink(self) -> int:
-        """Give free room back to the disk, a piece at a time; returns how many pages."""
+        """Return some free space to the disk; returns the number of pages."""

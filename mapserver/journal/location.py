@@ -1,4 +1,4 @@
-"""Where the journal of a store is: the one place that makes journals and readers, and knows which database it is."""
+"""The location of a store's journal; only this module makes journals and readers."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ JOURNAL_FILE = "journal.db"
 class JournalLocation:
     """The journal of one store.
 
-    folder: of the server, with snapshots, checkpoints and archive. url: of a PostgreSQL database that has the journal,
-    which several servers share: the folder is a cache then. Empty where the journal is a file in the folder.
+    folder: of the server, with snapshots, checkpoints, archive. url: of a PostgreSQL database that servers share, with
+    the folder as a cache; "" for a file in the folder.
     """
 
     folder: Path
@@ -35,23 +35,23 @@ class JournalLocation:
 
     @property
     def is_shared(self) -> bool:
-        """Whether servers on several hosts may take turns in writing it."""
+        """Whether several servers may take turns in writing."""
         return bool(self.url)
 
     @property
     def archive(self) -> Archive:
-        """The files that old rows move to."""
+        """The archive of old rows."""
         return Archive(self.folder / FOLDER)
 
     def exists(self) -> bool:
-        """Whether there is one."""
+        """Whether there is a journal."""
         return _postgres().reader.exists(self.url) if self.url else self._file.is_file()
 
     def open(self, site: str, frame: str, descends: Iterable[str] = (), waiting: Waiting | None = None) -> Journal:
-        """Become its writer, and make it where there is none; StoreError says why not.
+        """Become its writer, creating it if necessary; StoreError if impossible.
 
-        descends: ids of the stores that a new one is made from. waiting: what to do, again and again, while another
-        server writes a journal that is shared; without it, that is an error.
+        descends: ids of the stores a new one is made from. waiting: while another server writes a shared journal, else
+        an error.
         """
         self._require_one()
         if self.url:
@@ -62,45 +62,42 @@ class JournalLocation:
         return self.open_file(site, frame, descends)
 
     def open_file(self, site: str, frame: str, descends: Iterable[str] = ()) -> SqliteJournal:
-        """As `open`, of a file in the folder, which can be made to go on after an archive."""
+        """As `open`, for a file, which may continue after an archive."""
         return SqliteJournal(self._file, site, frame, descends)
 
     def reader(self) -> JournalReader:
-        """Read it; StoreError where that cannot be done."""
+        """Open a reader; StoreError if impossible."""
         return _postgres().reader.PostgresReader(self.url) if self.url else SqliteReader(self._file)
 
     def file_reader(self) -> SqliteReader:
-        """As `reader`, of a file in the folder, which can be copied."""
+        """As `reader`, for a file, which can be copied."""
         return SqliteReader(self._file)
 
     def store_id(self) -> str:
-        """Id of the store; empty where there is none yet. StoreError where it cannot be read."""
+        """Id of the store, "" for none; StoreError if unreadable."""
         if not self.exists():
             return ""
         with self.reader() as reader:
             return reader.identity().id
 
     def epoch(self) -> int:
-        """The epoch of the newest writer; StoreError where it cannot be read."""
+        """Epoch of the newest writer; StoreError if unreadable."""
         with self.reader() as reader:
             return reader.state().epoch
 
     def prepared_id(self, site: str, frame: str) -> str:
-        """As `store_id`, before a server waits for its turn; one that is shared is made where there never was one.
-
-        Servers that start at once on a new database know by its id that they have one journal.
-        """
+        """As `store_id`, before waiting for a turn; creates a shared journal, so that servers agree on its id."""
         if self.url:
             self._require_one()
             _postgres().journal.prepare(self.url, self.folder, site, frame)
         return self.store_id()
 
     def trusted_row(self, journal: JournalQueries) -> int:
-        """What the folder has of rows up to this one is of the journal; see `Journal`. Before it is opened to write."""
+        """As `Journal.trusted_row`, before opening to write."""
         return int(_postgres().mark.trusted_row(self.folder, journal)) if self.url else journal.last_row
 
     def traces(self, *, in_use: bool) -> Traces:
-        """What lies beside it and tells how far it once was. in_use: by a server, which has looked at its log."""
+        """Traces of how far it once was. in_use: a server has examined its log."""
         if self.url:
             mark: Traces = _postgres().mark.traces_in(self.folder)
             return mark
@@ -108,7 +105,7 @@ class JournalLocation:
         return replace(traces, log=LogScan()) if in_use else traces
 
     def _require_one(self) -> None:
-        """ConfigError where the folder is another journal's: its snapshots are not true for this one."""
+        """ConfigError if the folder belongs to another journal, with its snapshots."""
         if self.url and self._file.exists():
             raise ConfigError(self.folder, f"has a {JOURNAL_FILE} of its own; choose another --store for --journal")
         if not self.url and (self.folder / MARK_FILE).exists():
@@ -121,7 +118,7 @@ class JournalLocation:
 
 
 def _postgres() -> Any:
-    """The modules that need the extra `postgres`; ConfigError where it is not installed."""
+    """Modules of the extra `postgres`; ConfigError if not installed."""
     try:
         from mapserver.journal import postgres
         from mapserver.journal.postgres import connection, journal, mark, reader  # noqa: F401

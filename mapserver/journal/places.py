@@ -1,4 +1,4 @@
-"""Places of files beside those of this host: any store that fsspec reaches, by its address, as `s3://bucket/folder`."""
+"""Files in any store that fsspec reaches, by addresses such as `s3://bucket/folder`."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from protocol.errors import ConfigError, StoreError
 
 @dataclass(frozen=True, order=True)
 class FilePlace:
-    """A file or a folder; what it is asked has the names and the meaning that `pathlib.Path` gives them.
+    """A remote file or folder; methods as of `pathlib.Path`.
 
-    StoreError where its store cannot be reached, FileNotFoundError for a file that is not there.
+    StoreError if its store is unreachable, FileNotFoundError for a missing file.
     """
 
     url: str
 
     @property
     def name(self) -> str:
-        """The last part of its address."""
+        """The last part of the address."""
         return self.url.rpartition("/")[2]
 
     @property
     def stem(self) -> str:
-        """The name without its suffix."""
+        """The name without suffix."""
         return self.name.rpartition(".")[0] or self.name
 
     @property
     def parent(self) -> FilePlace:
-        """The folder that it lies in."""
+        """The parent folder."""
         return FilePlace(self.url.rpartition("/")[0])
 
     def __truediv__(self, name: str) -> FilePlace:
@@ -44,7 +44,7 @@ class FilePlace:
         return self.url
 
     def exists(self) -> bool:
-        """Whether there is such a file or folder."""
+        """Whether it exists."""
         with self._reached() as store:
             return bool(store.exists(self.url))
 
@@ -54,25 +54,25 @@ class FilePlace:
             return bool(store.isdir(self.url))
 
     def glob(self, pattern: str) -> list[FilePlace]:
-        """Files of a folder whose names match."""
+        """Files in a folder with matching names."""
         with self._reached() as store:
             names = (str(path).rstrip("/").rpartition("/")[2] for path in store.ls(self.url, detail=False))
             return [self / name for name in names if fnmatch(name, pattern)]
 
     def open(self, mode: str) -> BinaryIO:
-        """Open it for reading."""
+        """Open for reading."""
         with self._reached() as store:
             file: BinaryIO = store.open(self.url, mode)
             return file
 
     def read_text(self, encoding: str) -> str:
-        """All of a file."""
+        """The whole file."""
         with self._reached() as store:
             return bytes(store.cat_file(self.url)).decode(encoding)
 
     @contextmanager
     def _reached(self) -> Iterator[Any]:
-        """The store that it is in; every kind of store has errors of its own, which become one."""
+        """The file's store; any errors become one kind."""
         try:
             yield filesystem(self.url)
         except (FileNotFoundError, UnicodeDecodeError, ConfigError):
@@ -82,7 +82,7 @@ class FilePlace:
 
 
 def place(text: str) -> Path | FilePlace:
-    """Parse a path of this host, or the address of another place; ConfigError where no library reaches that."""
+    """Parse a local path or a remote address; ConfigError if no library reaches it."""
     if "://" not in text:
         return Path(text)
     filesystem(text)
@@ -90,7 +90,7 @@ def place(text: str) -> Path | FilePlace:
 
 
 def filesystem(url: str) -> Any:
-    """The store of an address, as fsspec reaches it."""
+    """The fsspec store of an address."""
     try:
         fsspec = import_module("fsspec")
     except ModuleNotFoundError:

@@ -1,7 +1,7 @@
-"""Journal rows as bytes: one record each, checked and taken apart many at a time; where their samples lie.
+"""Journal rows as bytes, one record each, and their bulk decoding.
 
-A record is little-endian: HEAD, the machine's name, the samples as SAMPLE_DTYPE, and the CRC-32 of all that. The CRC-32
-of a whole record is then the same number for all, SOUND: a record is checked before anything in it is believed.
+A record is little-endian: HEAD, machine name, samples as SAMPLE_DTYPE, CRC-32 of all that. The CRC-32 of a whole record
+is then always SOUND, so it is checked before anything is decoded.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from protocol.machine.samples import SAMPLE_DTYPE
 HEAD = np.dtype(
     [("row", "<i8"), ("received_ns", "<i8"), ("spool_id", "<u8"), ("first_seq", "<i8"), ("name_bytes", "u1")]
 )
-SOUND = 0x2144DF1C  # what a CRC-32 behind its own data always comes to
+SOUND = 0x2144DF1C  # CRC-32 of any data followed by its CRC-32
 _HEAD_BYTES, _SAMPLE_BYTES, _CRC_BYTES = HEAD.itemsize, SAMPLE_DTYPE.itemsize, 4
 
 
@@ -33,18 +33,18 @@ def record(row: JournalRow) -> bytes:
 
 
 def checksum_of(record: bytes) -> int:
-    """The checksum that a record was written with."""
+    """A record's checksum."""
     return int.from_bytes(record[-_CRC_BYTES:], "little")
 
 
 def last_checksum(rows: JournalRows) -> int:
-    """The checksum that the last one of some rows was written with."""
+    """Checksum of the last row."""
     (last,) = rows.chosen(rows.numbers == rows.numbers[-1])
     return checksum_of(record(last))
 
 
 def warm_up() -> None:
-    """Compile the kernels, or read them from their cache, before a batch waits for them."""
+    """Compile the kernels, or load them, before a batch waits for them."""
     row = JournalRow(1, "", 1, 1, np.zeros(1, SAMPLE_DTYPE))
     decoded([1], [record(row)])
     extent_of(row.rows)
@@ -52,9 +52,9 @@ def warm_up() -> None:
 
 @numba.njit(cache=True, nogil=True)
 def extent_of(samples: Table) -> tuple[int, int, float, float, float, float]:
-    """When and where samples lie: first and last stamp, west, south, east, north.
+    """Extent of samples: first and last stamp, west, south, east, north.
 
-    Never -0.0, of which databases make 0.0: the checksum of what they give back would be another one.
+    Never -0.0, which databases turn into 0.0, with another checksum.
     """
     first = samples[0]
     first_ns = last_ns = first.stamp_ns
@@ -67,7 +67,7 @@ def extent_of(samples: Table) -> tuple[int, int, float, float, float, float]:
 
 
 def decoded(numbers: Sequence[int], records: Sequence[Any]) -> JournalRows:
-    """Decode rows up to the first record that is not what was written under its number."""
+    """Decode rows up to the first damaged or misnumbered record."""
     n = _first(_checks(records) != SOUND)
     ends = np.cumsum(np.fromiter(map(len, records[:n]), np.int64, n))
     data = np.frombuffer(b"".join(records[:n]), np.uint8)
@@ -86,12 +86,12 @@ def decoded(numbers: Sequence[int], records: Sequence[Any]) -> JournalRows:
 def _checks(records: Sequence[Any]) -> Ints:
     try:
         return np.fromiter(map(zlib.crc32, records), np.int64, len(records))
-    except TypeError:  # damage has turned one into what is no bytes at all
+    except TypeError:  # damage may change a value's type
         return np.array([zlib.crc32(each) if isinstance(each, bytes) else -1 for each in records], np.int64)
 
 
 def _first(wrong: Bools) -> int:
-    """How many are right before the first wrong one."""
+    """Number before the first wrong one."""
     return int(wrong.argmax()) if wrong.any() else len(wrong)
 
 
@@ -106,11 +106,10 @@ def _split(
     samples: AnyArray,
     slots: Any,
 ) -> tuple[int, int]:
-    """Cut records into their parts; returns how many samples, and how many machines they are of.
+    """Split records; returns the numbers of samples and machines.
 
-    data: records one behind the other, up to ends (k,). Fills heads (k, bytes), lengths (k,) in samples, machine (k,):
-    numbers of names, firsts: the first record of each name, samples (bytes). slots: -1, more than twice as many as
-    records.
+    data: consecutive records, ending at ends (k,). Fills heads (k, bytes), lengths (k,) in samples, machine (k,) name
+    numbers, firsts: first record of each name, samples (bytes). slots: -1, more than twice as many as records.
     """
     begin, used, names = 0, 0, 0
     for k in range(len(ends)):
@@ -129,8 +128,8 @@ def _split(
 
 @numba.njit(cache=True, nogil=True)
 def _number_of(data: AnyArray, first: int, end: int, k: int, names: int, ends: Any, firsts: Any, slots: Any) -> int:
-    """Number of the name in data[first:end], a new one (`names`) where it is the first of record k."""
-    place = np.uint64(14695981039346656037)  # FNV-1a, spread over slots
+    """Number of the name in data[first:end]; `names` for a new one."""
+    place = np.uint64(14695981039346656037)  # FNV-1a hash
     for i in range(first, end):
         place = (place ^ np.uint64(data[i])) * np.uint64(1099511628211)
     slot = np.int64(place & np.uint64(len(slots) - 1))

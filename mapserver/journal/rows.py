@@ -1,8 +1,4 @@
-"""What a journal holds, as values: admitted batches, rows, watermarks, events; which rows to read; checksums.
-
-`Progress` is how far all spools have come, and what that comes to for each machine: kept up to date, never counted
-anew.
-"""
+"""A journal's content as values: batches, rows, watermarks, events; selections; checksums."""
 
 from __future__ import annotations
 
@@ -26,13 +22,13 @@ from protocol.site.geometry import Bounds
 from protocol.wire.messages import SampleBatch
 
 SpoolKey = tuple[str, int]  # machine, spool_id
-LAST = 2**63 - 1  # no row has a higher number
+LAST = 2**63 - 1  # no row number is higher
 _EXTENT = struct.Struct("<3q4d")
 
 
 @dataclass(frozen=True)
 class Admission:
-    """What of a batch is new. batch: trimmed to it; trimmed: samples it had already; lost: samples declared lost."""
+    """The new part of a batch. trimmed: samples known before; lost: declared lost."""
 
     batch: SampleBatch
     trimmed: int
@@ -40,13 +36,13 @@ class Admission:
 
     @property
     def watermark(self) -> int:
-        """The last sample that is on disk once this is committed."""
+        """The last sample on disk after the commit."""
         return self.batch.last_seq
 
 
 @dataclass(frozen=True)
 class JournalRow:
-    """One admitted batch as it lies on disk. received_ns: the server's clock when it came in."""
+    """An admitted batch on disk. received_ns: server time of reception."""
 
     row: int
     machine: str
@@ -58,10 +54,10 @@ class JournalRow:
 
 @dataclass(frozen=True)
 class JournalRows:
-    """Journal rows in one table; iterated over, they are the rows one by one.
+    """Journal rows as a table; iterable.
 
-    samples (n,): of all rows, one behind the other. lengths (k,): samples of each row. machines: names, each once;
-    machine (k,): index of each row's in them. The others (k,): as in JournalRow.
+    samples (n,): of all rows. lengths (k,): samples per row. machines: names; machine (k,): indices. Others (k,): as
+    JournalRow.
     """
 
     samples: Table
@@ -75,7 +71,7 @@ class JournalRows:
 
     @classmethod
     def joined(cls, rows: Sequence[JournalRow]) -> JournalRows:
-        """Rows in one table."""
+        """Join rows."""
         numbers = {name: number for number, name in enumerate(dict.fromkeys(row.machine for row in rows))}
         return cls(
             joined([row.rows for row in rows]),
@@ -99,12 +95,12 @@ class JournalRows:
             yield JournalRow(number, self.machines[machine], spool_id, first_seq, self.samples[begin:end], received_ns)
 
     def names(self) -> NDArray[np.uint64]:
-        """Hash of its machine's name for each sample (n,), as `Grid.fold_all` wants it."""
+        """Hash of the machine's name for each sample (n,)."""
         hashes = np.array([name_hash(machine) for machine in self.machines], np.uint64)
         return np.repeat(hashes[self.machine], self.lengths)
 
     def chosen(self, rows: Bools) -> JournalRows:
-        """Those rows (k,) alone."""
+        """Rows (k,) where True."""
         if rows.all():
             return self
         columns = ("lengths", "machine", "numbers", "spool_ids", "first_seqs", "received_ns")
@@ -112,7 +108,7 @@ class JournalRows:
         return replace(self, samples=samples, **{name: getattr(self, name)[rows] for name in columns})
 
     def cut(self, kept: Bools, number: int) -> JournalRows:
-        """Those samples (n,) alone, rows numbered from `number` on; one is cut where a sample in it is not kept."""
+        """Samples (n,) where True; rows are renumbered from `number`, and split at gaps."""
         if kept.all():
             return replace(self, numbers=np.arange(number, number + len(self)))
         begins = self.pieces(kept)
@@ -129,23 +125,23 @@ class JournalRows:
         )
 
     def pieces(self, kept: Bools) -> Bools:
-        """Which samples (n,) begin a row of what `cut` gives."""
+        """Which samples (n,) begin a row of `cut`."""
         starts: Bools = np.zeros(len(self.samples), np.bool_)
         starts[np.cumsum(self.lengths) - self.lengths] = True
         begins: Bools = kept & (starts | ~np.append(False, kept[:-1]))
         return begins
 
     def first(self, n: int) -> JournalRows:
-        """The first `n` rows alone."""
+        """The first `n` rows."""
         return self.chosen(np.arange(len(self)) < n)
 
     def without(self, machines: frozenset[str]) -> JournalRows:
-        """Rows of all other machines."""
+        """Rows of other machines."""
         others = np.array([machine not in machines for machine in self.machines], np.bool_)
         return self.chosen(others[self.machine])
 
     def selected(self, selection: Selection) -> tuple[Table, NDArray[np.uint64]]:
-        """Samples that are selected by stamp and place, corrected, (m,), and hashes of their machines' names, (m,)."""
+        """Corrected samples (m,) in time and place, and hashes of their machines' names (m,)."""
         chosen = selection.includes(self.samples)
         samples, names, machine = self.samples, self.names(), np.repeat(self.machine, self.lengths)
         if not chosen.all():
@@ -156,10 +152,10 @@ class JournalRows:
 
 @dataclass(frozen=True)
 class Selection:
-    """Which journal rows to read. A row that may hold a selected sample is given whole, bytes as they were sent.
+    """Which rows to read; any with a selected sample, whole and as sent.
 
-    from_ns, to_ns: rows with samples in from_ns <= stamp <= to_ns. bounds: rows whose samples' bounding box touches it.
-    without: machines to exclude. corrections: of what `JournalRows.selected` gives.
+    from_ns, to_ns: inclusive. bounds: touched by a row's bounding box. without: excluded machines. corrections: for
+    `JournalRows.selected`.
     """
 
     from_ns: int = 0
@@ -170,12 +166,12 @@ class Selection:
 
     @classmethod
     def by(cls, facts: Facts, from_ns: int = 0, to_ns: int = MAX_STAMP_NS, bounds: Bounds | None = None) -> Selection:
-        """What a map with these facts is made of."""
+        """Selection for a map with these facts."""
         return cls(from_ns, to_ns, bounds, facts.excluded, facts.corrections)
 
     @property
     def everywhere(self) -> bool:
-        """Whether neither time nor place excludes a row."""
+        """Whether no row is excluded by time or place."""
         return (self.from_ns, self.to_ns, self.bounds) == (0, MAX_STAMP_NS, None)
 
     def includes(self, samples: Table) -> Bools:
@@ -192,7 +188,7 @@ ALL = Selection()
 
 @dataclass(frozen=True)
 class Watermark:
-    """Progress of one spool: the last committed sample, how many it declared lost, and its newest stamp."""
+    """Progress of one spool: last committed sample, declared losses, newest stamp."""
 
     seq: int = 0
     lost: int = 0
@@ -201,7 +197,7 @@ class Watermark:
 
 @dataclass(frozen=True)
 class StoreIdentity:
-    """Which store this is. id: drawn when it is made, and kept by its copies; descends: of what it was folded from."""
+    """A store's identity. id: random, kept by copies; descends: of the stores it was made from."""
 
     id: str
     descends: tuple[str, ...] = ()
@@ -209,7 +205,7 @@ class StoreIdentity:
 
 @dataclass(frozen=True)
 class MachineTotals:
-    """What one machine sent: spools, samples, samples that it declared lost, newest stamp."""
+    """Totals of one machine."""
 
     spools: int = 0
     samples: int = 0
@@ -219,7 +215,7 @@ class MachineTotals:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that the server has to remember and that is no sample; body: plain values."""
+    """Something to remember that is no sample; body: plain values."""
 
     id: int
     kind: str
@@ -228,17 +224,17 @@ class Event:
 
     @property
     def text(self) -> str:
-        """Its body as it is kept."""
+        """The body as stored."""
         return json.dumps(self.body, allow_nan=False)
 
     @property
     def checksum(self) -> int:
-        """The checksum that it is written with."""
+        """The checksum as stored."""
         return checksum(self.id, self.kind, self.stamp_ns, self.text)
 
 
 def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float) -> int:
-    """CRC-32 of when and where a row lies, ten times as fast as `checksum`; -1 where a value has the wrong type."""
+    """CRC-32 of a row's extent, ten times as fast as `checksum`; -1 for wrong types."""
     try:
         return zlib.crc32(_EXTENT.pack(row, first_ns, last_ns, *box))
     except struct.error:
@@ -246,12 +242,12 @@ def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float) -> int:
 
 
 def checksum(*values: object) -> int:
-    """CRC-32 of plain values, bytes among them."""
+    """CRC-32 of plain values and bytes."""
     return zlib.crc32(repr(values).encode())
 
 
 class Progress:
-    """Watermarks of all spools. samples: that all machines sent."""
+    """Watermarks of all spools. samples: of all machines."""
 
     def __init__(self, watermarks: Mapping[SpoolKey, Watermark]) -> None:
         self._watermarks: dict[SpoolKey, Watermark] = {}
@@ -265,7 +261,7 @@ class Progress:
         return self._watermarks.get((machine, spool_id), Watermark())
 
     def known(self, spool: SpoolKey) -> Watermark | None:
-        """Progress of one spool, None for one that there is not."""
+        """Progress of one spool, or None."""
         return self._watermarks.get(spool)
 
     def watermarks(self) -> dict[SpoolKey, Watermark]:

@@ -1,7 +1,6 @@
-"""What was acknowledged and is not in the journal: found when it is opened, kept as an event, never forgotten.
+"""Shortfalls: acknowledged data missing from an opened journal, kept as events for ever.
 
-A machine that still has such samples sends them again; one that has not declares them lost. Either moves the watermark
-past them, so what is missing is always what no watermark has reached.
+Machines send missing samples again or declare them lost, which moves watermarks; the rest is missing.
 """
 
 from __future__ import annotations
@@ -15,12 +14,12 @@ from mapserver.journal.rows import Event, SpoolKey, Watermark
 from protocol.disk.high_water_mark import Traces
 
 KIND = "shortfall"
-ROW, EVENT = "row", "event"  # names of a mark; the others are those of spools
+ROW, EVENT = "row", "event"  # names in a mark; others are of spools
 
 
 @dataclass(frozen=True)
 class SpoolShortfall:
-    """Samples after < seq <= until of one spool were acknowledged."""
+    """Acknowledged samples after < seq <= until of one spool."""
 
     machine: str
     spool_id: int
@@ -29,15 +28,15 @@ class SpoolShortfall:
 
     @property
     def samples(self) -> int:
-        """How many."""
+        """Number of samples."""
         return self.until - self.after
 
 
 @dataclass(frozen=True)
 class Shortfall:
-    """What an opened journal lacks. row, event: the last ones that it has; expected_row, expected_event: that it had.
+    """What a journal lacks. row, event: last present; expected_row, expected_event: last known.
 
-    damage: what is wrong with the write-ahead log, or which snapshot lies beyond; empty where nothing tells why.
+    damage: of the write-ahead log, or a snapshot beyond, or "".
     """
 
     row: int
@@ -48,13 +47,13 @@ class Shortfall:
     damage: str = ""
 
     def body(self) -> dict[str, Any]:
-        """As an event keeps it."""
+        """As plain values of an event."""
         spools = [[s.machine, f"{s.spool_id:016x}", s.after, s.until] for s in self.spools]
         return {**vars(self), "spools": spools}
 
     @classmethod
     def from_event(cls, event: Event) -> Shortfall:
-        """Undo `body`."""
+        """Inverse of `body`."""
         spools = (SpoolShortfall(name, int(spool, 16), *span) for name, spool, *span in event.body["spools"])
         return cls(**{**event.body, "spools": tuple(spools)})
 
@@ -73,17 +72,17 @@ class Shortfall:
 
 
 def spool_name(machine: str, spool_id: int) -> str:
-    """Name of a spool's watermark in a mark."""
+    """Name of a spool in a mark."""
     return f"{machine} {spool_id:016x}"
 
 
 def marked(row: int, event: int, watermarks: Mapping[SpoolKey, Watermark]) -> dict[str, int]:
-    """What a mark says of a journal."""
+    """A journal's progress as in a mark."""
     return {ROW: row, EVENT: event, **{spool_name(*spool): mark.seq for spool, mark in watermarks.items()}}
 
 
 def compare(traces: Traces, present: Mapping[str, int]) -> Shortfall | None:
-    """Compare what lies beside a journal with what the journal has, `marked`; None where nothing is missing."""
+    """Compare a journal's traces with its progress (`marked`); None if nothing is missing."""
     before = traces.mark
     spools = [
         SpoolShortfall(name, int(spool, 16), present.get(f"{name} {spool}", 0), until)
@@ -102,12 +101,12 @@ def compare(traces: Traces, present: Mapping[str, int]) -> Shortfall | None:
 
 
 def beyond(last_row: int, snapshot_row: int) -> Shortfall:
-    """What a snapshot proves that is true for a row which the journal does not reach."""
+    """The shortfall proved by a snapshot beyond the journal."""
     return Shortfall(last_row, snapshot_row, damage=f"a snapshot of row {snapshot_row} lies beyond the journal")
 
 
 def missing(shortfalls: Iterable[Shortfall], watermarks: Mapping[SpoolKey, Watermark]) -> Counter[str]:
-    """Samples by machine that were acknowledged, are gone, and that it has neither sent again nor declared lost."""
+    """Missing acknowledged samples by machine, not sent again or declared lost."""
     until: dict[SpoolKey, int] = {}
     for spool in (spool for shortfall in shortfalls for spool in shortfall.spools):
         key = (spool.machine, spool.spool_id)

@@ -1,7 +1,7 @@
-"""Which stretches of a journal hold which stamps, so that a read of some hours passes over all others.
+"""An index of stamps over a journal, so that reads of a time span skip other rows.
 
-Rows come in nearly in the order of their stamps. So the least and greatest stamp of every CHUNK rows tell which extents
-to look at; for a sample that comes in late, these are some more.
+Rows arrive nearly in order of stamps, so the least and greatest stamp of each CHUNK select the extents to read; late
+samples add some.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import LAST, Selection
 from protocol.arrays import Bools, Ints
 
-CHUNK = 1024  # rows: a look through their extents takes 0.1 ms
+CHUNK = 1024  # rows; reading their extents takes 0.1 ms
 
 
 class StampIndex:
-    """Least and greatest stamp of every CHUNK rows of one journal; for any thread, each with a reader of its own.
+    """Least and greatest stamp of every CHUNK rows. Thread-safe, with a reader per thread.
 
-    Where an answer is about archived rows as well, that is said; their files have such an index themselves.
+    Archived rows are not indexed; their files are.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._chunks: Ints = np.empty((0, 3), np.int64)  # number, least and greatest stamp
-        self._known = 0  # rows up to this one are in it, or were archived before
+        self._known = 0  # last row indexed or archived before
 
     def stretches(
         self, journal: JournalReader, after: int, until: int, selection: Selection
     ) -> Iterator[tuple[int, int]]:
-        """Stretches a < row <= b of after < row <= until, in order, beside which no row has a selected stamp.
+        """Intervals a < row <= b of after < row <= until that contain all rows with selected stamps, in order.
 
-        All that are archived are one stretch.
+        Archived rows form one interval.
         """
         chunks, known = self._extended(journal)
-        archived = journal.archived_row  # asked last: all rows beyond it were there when the chunks were looked at
+        archived = journal.archived_row  # asked last, so that later rows were there for the chunks
         if after < min(archived, until):
             yield after, min(archived, until)
         hit = (chunks[:, 1] <= selection.to_ns) & (chunks[:, 2] >= selection.from_ns)
@@ -46,10 +46,7 @@ class StampIndex:
                 yield max(first, after, archived), min(last, until)
 
     def next_stamp(self, journal: JournalReader, from_ns: int) -> int | None:
-        """The least stamp from `from_ns` on of all rows that are not archived; None for none.
-
-        Of a row that reaches across `from_ns`, this is `from_ns`.
-        """
+        """The least stamp since from_ns of unarchived rows, or None. It is from_ns if a row spans it."""
         chunks, known = self._extended(journal)
         later = chunks[:, 1] >= from_ns
         across: Bools = ~later & (chunks[:, 2] >= from_ns)
@@ -57,7 +54,7 @@ class StampIndex:
         return min([*chunks[later, 1].tolist(), *(stamp for stamp in looked if stamp is not None)], default=None)
 
     def _extended(self, journal: JournalReader) -> tuple[Ints, int]:
-        """Chunks, and the last row that is in them, with all that were filled meanwhile."""
+        """Chunks and their last row, updated."""
         with self._lock:
             until = journal.last_row // CHUNK * CHUNK
             if until > self._known:
@@ -67,6 +64,6 @@ class StampIndex:
 
 
 def _runs(numbers: Ints) -> list[tuple[int, int]]:
-    """Chunks that follow each other as stretches a < row <= b."""
+    """Intervals a < row <= b of consecutive chunks."""
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     return [(int(run[0]) * CHUNK, (int(run[-1]) + 1) * CHUNK) for run in runs if len(run)]

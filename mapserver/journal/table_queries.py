@@ -1,4 +1,4 @@
-"""What can be read of a journal and how it is checked, in words that every database with these tables knows."""
+"""Queries and checks of a journal, in SQL common to all databases."""
 
 from __future__ import annotations
 
@@ -28,24 +28,23 @@ from mapserver.journal.rows import (
 )
 from protocol.errors import StoreError
 
-BYTES_AT_ONCE = 2**20  # or the rows that pass it; what is read of them stays in the processor's cache
+BYTES_AT_ONCE = 2**20  # per piece, to stay in the processor's cache
 _EXTENTS_AT_ONCE = 10_000
 
 
 class TableQueries(ABC):
     """`JournalQueries` over the tables meta, journal, extent, watermark and events.
 
-    When and where the samples of a row lie is a table of its own: 50 bytes a row, so that a read by time and place
-    passes over rows without touching the pages of their payloads. Such a read cannot see that it misses a row where a
-    bit of its extent has flipped; so extents have a checksum of their own, which is checked on opening.
+    Extents have a table of 50 bytes a row, so reads by time and place skip payloads. A flipped bit there would silently
+    hide a row, so extents have checksums, checked on opening.
     """
 
-    schema: int  # the only one: a journal of another one is refused
+    schema: int  # the only supported one
 
     @property
     @abstractmethod
     def where(self) -> str:
-        """Where it is, for people."""
+        """Its location, for people."""
 
     @property
     @abstractmethod
@@ -63,15 +62,15 @@ class TableQueries(ABC):
 
     @abstractmethod
     def _query(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """All lines of an answer. query: values are question marks; raises StoreError."""
+        """All lines of an answer; values are question marks. Raises StoreError."""
 
     @abstractmethod
     def _piece(self, after: int, until: int, selection: Selection) -> tuple[list[int], list[Any], bool]:
-        """Numbers and records of the next rows, of BYTES_AT_ONCE or some more, and whether there are no more."""
+        """Numbers and records of the next rows, about BYTES_AT_ONCE, and whether these are the last."""
 
     @abstractmethod
     def _one_state(self) -> AbstractContextManager[None]:
-        """Have all that is read be of one time, also while a server writes."""
+        """All reads within see one state."""
 
     def watermarks(self) -> dict[SpoolKey, Watermark]:
         """See `JournalQueries`."""
@@ -94,9 +93,9 @@ class TableQueries(ABC):
     def read_many(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRows]:
         """See `JournalQueries`."""
         while True:
-            last = min(until, self.last_row)  # asked before the rows are read: all up to this one must be there
+            last = min(until, self.last_row)  # before reading: rows up to this one must be there
             numbers, records, is_end = self._piece(after, until, selection)
-            # Asked after the rows were read: none beyond this one had been removed then.
+            # after reading: rows beyond this one had not been removed
             if after < min(archived := self.archived_row, until):
                 raise ArchivedError(self.where, archived)
             there = _dense(numbers, after) if selection.everywhere else len(numbers)
@@ -151,7 +150,7 @@ class TableQueries(ABC):
             self._load_watermarks()
 
     def _meta(self) -> dict[str, str]:
-        """All of the table meta; StoreError where the journal has another schema, or a line is damaged."""
+        """The table meta; StoreError for another schema, or damage."""
         (schema,) = self._query("SELECT value FROM meta WHERE key = 'schema'") or [(None,)]
         if schema != (str(self.schema),):
             problem = f"has schema {schema[0]!r}, this version knows {self.schema}"
@@ -175,7 +174,7 @@ class TableQueries(ABC):
             raise self._damaged(f"the value {value!r}") from None
 
     def _require_each(self, numbers: Iterable[int], after: int, last: int = 0) -> None:
-        """StoreError unless each number follows the one before, from `after` on, to `last` at least."""
+        """StoreError unless numbers are consecutive, from `after` to at least `last`."""
         for number in numbers:
             if number != after + 1:
                 raise self._damaged(f"what follows number {after}")
@@ -187,7 +186,7 @@ class TableQueries(ABC):
         return StoreError(self.where, f"{what} is damaged; restore the file from a backup")
 
     def _extent_rows(self) -> Iterator[int]:
-        """The rows that have an extent, in order; read in pieces, since there may be millions."""
+        """Rows with an extent, in order; in pieces, because there may be millions."""
         query, row = "SELECT * FROM extent WHERE row > ? ORDER BY row LIMIT ?", 0
         while piece := self._query(query, (row, _EXTENTS_AT_ONCE)):
             for *extent, crc32 in piece:
@@ -212,14 +211,14 @@ class TableQueries(ABC):
 
 
 def _dense(numbers: Sequence[int], after: int) -> int:
-    """How many of the first numbers follow each other, from `after` on."""
+    """Number of leading consecutive numbers."""
     gaps = np.flatnonzero(np.array(numbers, np.int64) != np.arange(after + 1, after + 1 + len(numbers)))
     return int(gaps[0]) if len(gaps) else len(numbers)
 
 
 def size_of(records: Sequence[Any]) -> int:
-    """How many bytes records have."""
+    """Total bytes."""
     try:
         return sum(map(len, records))
-    except TypeError:  # damage has turned one into a number
+    except TypeError:  # damage may change a value's type
         return BYTES_AT_ONCE

@@ -1,4 +1,4 @@
-"""What the writer of a journal does whatever keeps it: rows and watermarks of admissions, progress, what is missing."""
+"""The database-independent part of a journal's writer."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class TableWriter(TableQueries):
 
     @abstractmethod
     def _insert(self, row: int, record: bytes, extent: Line) -> None:
-        """Write the next row into the open transaction. extent: its line, with checksum."""
+        """Write the next row into the open transaction. extent: with checksum."""
 
     @property
     def samples(self) -> int:
@@ -94,7 +94,7 @@ class TableWriter(TableQueries):
         self.append_event(SHORTFALL, newest_ns, shortfall.body())
 
     def _require_meta(self, site: str, frame: str) -> None:
-        """StoreError unless it is this site's."""
+        """StoreError for another site."""
         meta = self._meta()
         for key, value in (("site", site), ("frame", frame)):
             if meta[key] != value:
@@ -105,24 +105,24 @@ class TableWriter(TableQueries):
 
 
 def new_meta(schema: int, site: str, frame: str, descends: Iterable[str]) -> list[Line]:
-    """What a new journal says of itself. descends: ids of the stores that it is made from."""
+    """Meta lines of a new journal. descends: ids of the stores it is made from."""
     store = " ".join((secrets.token_hex(8), *descends))
     meta = {"schema": str(schema), "site": site, "frame": frame, "store": store}
     return [meta_line(*each) for each in meta.items()]
 
 
 def meta_line(key: str, value: str) -> Line:
-    """What a journal says of itself, as its table has it."""
+    """With checksum."""
     return key, value, checksum(key, value)
 
 
 def watermark_line(machine: str, spool_id: int, watermark: Watermark) -> Line:
-    """A watermark as its table has it: databases' integers are signed, so 64-bit ids are stored as bytes."""
+    """With checksum; 64-bit ids as bytes, because databases' integers are signed."""
     values = (machine, spool_id.to_bytes(8, "big"), watermark.seq, watermark.lost, watermark.newest_ns)
     return (*values, checksum(*values))
 
 
 def event_lines(events: Iterable[PlainEvent], after: int) -> list[Line]:
-    """Events as their table has them, with the numbers after `after`."""
+    """Lines of events, numbered after `after`."""
     numbered = (Event(number, *event) for number, event in enumerate(events, start=after + 1))
     return [(event.id, event.kind, event.stamp_ns, event.text, event.checksum) for event in numbered]

@@ -1,9 +1,7 @@
-"""How far a journal was read, and whether it is still the one that was read.
+"""How far a journal was read, and whether it has diverged since.
 
-A row that was read may be gone when the journal is looked at again: a store that was restored, a database that failed
-over. It is noticed by the id of the store, by numbers and checksums of the last row (in journal or archive) and of the
-last event, and by an epoch that is lower than before. A replica of a database that is behind another one has not lost
-anything.
+A restored or failed-over journal may lack rows already read. Signs: another store id, another checksum or number of the
+last row or event, a lower epoch. A lagging replica has lost nothing.
 """
 
 from __future__ import annotations
@@ -19,21 +17,21 @@ from protocol.errors import StoreError
 
 
 class Tail:
-    """Rows and events of one journal beyond the last ones that were read: `row`, `event`. Used by one thread at a time.
+    """Rows and events of a journal beyond the last ones read. For one thread.
 
-    store: the journal's id. problem: why there was no further row, None where there was none.
+    store: the journal's id. problem: why no further row was read, or None.
     """
 
     def __init__(self, reader: JournalReader, archive: Archive) -> None:
         self.store, self._archive, self._epoch = reader.identity().id, archive, reader.state().epoch
         self.row = self.event = 0
         self.problem: StoreError | OSError | None = None
-        self._checksum: int | None = None  # that the last row was written with, None where that is not known
+        self._checksum: int | None = None  # of the last row, if known
         self._event_checksum: int | None = None
-        self._compared: object = None  # where the last row was in the archive when it was compared
+        self._compared: object = None  # place of the last row in the archive when compared
 
     def rows(self, reader: JournalReader, until: int) -> Iterator[JournalRows]:
-        """The next rows up to `until`, many at a time; up to the first that cannot be read, which is a `problem`."""
+        """The next rows up to `until`, many at a time; a row that cannot be read ends them as `problem`."""
         self.problem = None
         try:
             for rows in read_history(History(reader, self._archive), self.row, until):
@@ -43,24 +41,24 @@ class Tail:
             self.problem = error
 
     def skip_to(self, reader: JournalReader, row: int) -> None:
-        """Go on behind a row that was read by others, as into a snapshot."""
+        """Continue after a row that others have read, for example into a snapshot."""
         self.row, self._checksum = row, History(reader, self._archive).row_checksum(row)
 
     def heard(self, events: Sequence[Event]) -> None:
-        """Go on behind events, which have been taken."""
+        """Continue after events."""
         if events:
             self.event, self._event_checksum = events[-1].id, events[-1].checksum
 
     def lags(self, reader: JournalReader, state: JournalState) -> bool:
-        """Whether the journal is read from a replica of the database that is behind another one, read before.
+        """Whether a database replica lags behind one read before.
 
-        Where rows are gone for good, the server that goes on has a higher epoch.
+        If rows are lost for good, the next server has a higher epoch.
         """
         lacks = state.row < self.row or state.event < self.event or state.epoch < self._epoch
         return lacks and reader.is_replica and state.epoch <= self._epoch and reader.identity().id == self.store
 
     def is_gone(self, reader: JournalReader, state: JournalState) -> bool:
-        """Whether the journal lacks what was read of it."""
+        """Whether the journal has diverged from what was read."""
         is_gone = (
             reader.identity().id != self.store
             or state.row < self.row
@@ -73,7 +71,7 @@ class Tail:
         return is_gone
 
     def is_in(self, journal: JournalQueries) -> bool:
-        """Whether a journal has the last row that was read, and not another one of its number."""
+        """Whether a journal has the last row read, with its checksum."""
         return self.row <= journal.last_row and (
             self.row <= journal.archived_row or journal.row_checksum(self.row) == self._checksum
         )
@@ -85,19 +83,19 @@ class Tail:
         return _is_other(checksum, self._checksum)
 
     def _archived_checksum(self, reader: JournalReader) -> int | None:
-        """Of the last row in the archive, which is read once; None where nothing new can be said."""
-        archive = Archive(self._archive.folder)  # with no file open: another one may have taken the place of one
+        """Checksum of the last row in the archive, read once; None if unchanged."""
+        archive = Archive(self._archive.folder)  # opens no file in advance, because files may be replaced
         try:
             (file,) = archive.cover(self.row, self.row - 1)
             stat = file.stat()
             if (seen := (self.row, file, stat.st_ino, stat.st_mtime_ns)) == self._compared:
                 return None
             checksum, self._compared = History(reader, archive).row_checksum(self.row), seen
-        except (StoreError, OSError):  # who needs the file says so
+        except (StoreError, OSError):  # reported by others, who need the file
             return None
         return checksum
 
 
 def _is_other(there: int | None, known: int | None) -> bool:
-    """Whether two checksums of one number are known, and differ: the journal has diverged."""
+    """Whether two known checksums differ: the journal has diverged."""
     return None not in (there, known) and there != known

@@ -1,3 +1,3 @@
-"""The journal in a PostgreSQL database, for sites whose map server must not be down or that many read."""
+"""The journal in a PostgreSQL database, for standby servers or many readers."""
 
-MARK_FILE = "journal-mark"  # in the folder of a server, beside its snapshots
+MARK_FILE = "journal-mark"  # in a server's folder, beside snapshots

@@ -1,4 +1,4 @@
-"""Connections to PostgreSQL as a journal needs them, and what its errors say in one line."""
+"""Connections to PostgreSQL, and its errors in one line."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from psycopg import conninfo
 from protocol.errors import ConfigError, StoreError
 
 Connection = psycopg.Connection[tuple[Any, ...]]
-SCHEMA = "sitegrid"  # the database's schema with the tables
+SCHEMA = "sitegrid"  # of the tables
 MISSING = ("3D000", "3F000", "42P01")  # SQLSTATEs: no such database, schema, table
 REPLICAS = """SELECT current_setting('synchronous_standby_names') <> '',
 (SELECT count(*) FROM pg_stat_replication)"""
-# Limits that the database has for others would end sessions that wait for an hour, and statements that read a long
-# journal; which there are depends on the version.
+# Reset limits that would end idle sessions and long reads; which exist depends on the version.
 _SET_UP = f"""SET search_path = {SCHEMA}; SET standard_conforming_strings = on;
 SELECT set_config(name, '0', false) FROM pg_settings
 WHERE name IN ('idle_session_timeout', 'statement_timeout', 'lock_timeout', 'transaction_timeout')"""  # noqa: S608
-# A server that is gone is noticed after three to four seconds, whatever it was doing then.
+# A vanished server is noticed after three to four seconds.
 DEFAULTS = {
     "connect_timeout": "3",
     "keepalives_idle": "1",
@@ -32,7 +31,7 @@ DEFAULTS = {
 
 
 def shown(url: str) -> str:
-    """A URL for people: without its password. ConfigError where it is none."""
+    """A URL without its password; ConfigError for no URL."""
     try:
         parts = conninfo.conninfo_to_dict(url)
     except psycopg.Error as error:
@@ -45,7 +44,7 @@ def shown(url: str) -> str:
 
 
 def connect(url: str, role: str, **more: str) -> Connection:
-    """Open a connection; psycopg.Error says why not. role: what the database shows of it."""
+    """Open a connection; raises psycopg.Error. role: shown by the database."""
     given = conninfo.conninfo_to_dict(url)
     settings = {**DEFAULTS, "application_name": f"sitegrid {role}", **given, **more}
     db = psycopg.connect("", autocommit=True, prepare_threshold=None, **settings)  # type: ignore[arg-type]
@@ -58,18 +57,18 @@ def connect(url: str, role: str, **more: str) -> Connection:
 
 
 def replica_of(*, synchronous: bool, replicas: int) -> str:
-    """What stands behind a database's disk, by what REPLICAS answers."""
+    """Replication behind a database's disk, by the answer to REPLICAS."""
     return "synchronous" if synchronous else "asynchronous" if replicas else "none"
 
 
 def line(error: psycopg.Error) -> str:
-    """What the database says, as one line."""
+    """The database's message in one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 @contextmanager
 def readable(where: str) -> Iterator[None]:
-    """Have what the database says be a StoreError."""
+    """Turn database errors into StoreError."""
     try:
         yield
     except psycopg.Error as error:

@@ -1,9 +1,8 @@
-"""The writer of a journal in PostgreSQL. Rows, watermarks and the line that numbers them are one transaction.
+"""The writer of a journal in PostgreSQL; rows, watermarks and row numbers are one transaction.
 
-A commit is one message: what it writes is gathered in memory until then. It names the epoch and the last row that this
-writer knows, and fails where the journal has others: a writer that has lost its lock without a word acknowledges
-nothing. Where its answer is lost it is not known whether it happened; then the lock and a new epoch are taken, which
-waits for a commit that is still under way, and the journal says.
+A commit is one message, gathered in memory. It names epoch and last row and fails if the journal has others, so a
+writer that lost its lock acknowledges nothing. If its answer is lost, the writer takes lock and a new epoch, which
+waits for a pending commit, and looks.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from protocol.errors import StoreError
 from protocol.files import make_private
 
 _WHOSE = "SELECT epoch, writer FROM head"
-LOOK_S = 0.1  # between two looks whether the lock is free
+LOOK_S = 0.1  # between attempts to take the lock
 _PUT = (
     "ON CONFLICT (machine, spool_id) DO UPDATE SET"
     " seq = excluded.seq, lost = excluded.lost, newest_ns = excluded.newest_ns, crc32 = excluded.crc32"
@@ -42,7 +41,7 @@ log = logging.getLogger("mapserver.journal.postgres.journal")
 
 
 def prepare(url: str, folder: Path, site: str, frame: str) -> None:
-    """Make the tables where there are none, before anybody is the writer; StoreError where it is no usable journal."""
+    """Create missing tables; StoreError if it is no usable journal."""
     with closing(WriterSession(url, shown(url))) as session:
         _prepare(session, shown(url), folder, site, frame)
 
@@ -50,7 +49,7 @@ def prepare(url: str, folder: Path, site: str, frame: str) -> None:
 def _prepare(
     session: WriterSession, where: str, folder: Path, site: str, frame: str, descends: Iterable[str] = ()
 ) -> None:
-    """As `prepare`: not where the folder is of a store, for which a new one would be in the way of its restore."""
+    """As `prepare`; not if the folder belongs to a store, whose restore a new one would obstruct."""
     if not (known := store_in(folder)):
         session.run(creation(site, frame, descends))
     elif not _is_there(session):
@@ -67,7 +66,7 @@ def _gone(where: str, was: str, or_else: str) -> StoreError:
 
 
 class PostgresJournal(TableWriter, PostgresQueries):
-    """See `Journal`. Reads on a session of its own."""
+    """See `Journal`. Reads on a separate session."""
 
     def __init__(
         self,
@@ -78,13 +77,10 @@ class PostgresJournal(TableWriter, PostgresQueries):
         descends: Iterable[str] = (),
         waiting: Waiting | None = None,
     ) -> None:
-        """folder: of the server, for its mark. waiting: what to do while another one writes.
-
-        Without `waiting`, StoreError where another one writes.
-        """
+        """folder: of the server, for its mark. waiting: while another one writes; without it StoreError."""
         super().__init__(url)
         self.fenced, self.epoch = "", 0
-        self._name = secrets.token_hex(8)  # beside its epochs, since the answer to who takes one may be lost
+        self._name = secrets.token_hex(8)  # recognises its epochs, because the answer to taking one may be lost
         self._row = self._newest = self._committed = 0
         self._rows: list[tuple[int, bytes]] = []
         self._extents: list[Line] = []
@@ -104,16 +100,16 @@ class PostgresJournal(TableWriter, PostgresQueries):
 
     @property
     def last_row(self) -> int:
-        """The last row, also of the open transaction."""
+        """The last row, including the open transaction."""
         return self._row
 
     @property
     def replica(self) -> str:
-        """See `Journal`: as of some seconds ago."""
+        """See `Journal`; some seconds old."""
         return self._session.replica
 
     def begin(self) -> None:
-        """See `Journal`. Where the session was lost, another one takes the lock and a new epoch."""
+        """See `Journal`. A lost session is replaced, with the lock and a new epoch."""
         if self.fenced:
             raise FencedError(self.where, self.fenced)
         if self._session.lost:
@@ -128,7 +124,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._progress.put(machine, spool_id, watermark)
 
     def commit(self) -> None:
-        """See `Journal`: also where nothing is written, since who has lost the journal must acknowledge nothing."""
+        """See `Journal`; even without writes, or a fenced writer might acknowledge."""
         puts = [watermark_line(*key, watermark) for key, watermark in self._puts.items()]
         self._run(
             self._advance(self._row, self._newest),
@@ -145,7 +141,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
             self._mark.write(changed)
 
     def rollback(self) -> None:
-        """See `Journal`: what is on disk beyond what was known, is so once `begin` has opened the journal again."""
+        """See `Journal`; `begin` reads what else is on disk."""
         if self._puts:
             known = self._progress.watermarks() | {key: mark for key, mark in self._before.items() if mark}
             self._progress = Progress({key: known[key] for key in known if self._before.get(key, True)})
@@ -177,7 +173,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
         return last
 
     def shrink(self) -> int:
-        """See `Journal`: PostgreSQL does so by itself."""
+        """See `Journal`; PostgreSQL does it."""
         return 0
 
     def close(self) -> None:
@@ -191,7 +187,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._row = row
 
     def _advance(self, row: int, event: int) -> str:
-        """The statement that every transaction begins with: it fails unless this writer's is the newest state."""
+        """First statement of each transaction: fails unless this writer's state is the newest."""
         return f"SELECT advance({self.epoch}, {self._committed}, {row}, {self._newest}, {event})"
 
     def _run(self, *statements: str) -> None:
@@ -205,7 +201,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._rows, self._extents, self._puts, self._before = [], [], {}, {}
 
     def _take_turn(self, waiting: Waiting | None) -> bool:
-        """Become the writer; False where the session was lost over it, for who may wait to try again."""
+        """Become the writer; False to wait, if the session was lost."""
         self._take_lock(waiting)
         try:
             self._require_same()
@@ -224,10 +220,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
         return self.epoch > 0
 
     def _take_lock(self, waiting: Waiting | None) -> None:
-        """Wait until no other session has the lock, also while the database is away.
-
-        Who may not wait waits for as long as the database needs to notice that the last holder is gone.
-        """
+        """Wait until the lock is free; without `waiting`, as long as the database needs to notice a dead holder."""
         end_s = time.monotonic() + 2 * HANGS_S
         while True:
             with suppress(UnwrittenError):
@@ -242,7 +235,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
             (waiting.follow if waiting else time.sleep)(LOOK_S)
 
     def _require(self, folder: Path, site: str, frame: str) -> None:
-        """StoreError unless it is this site's and the folder's, which is this journal's from now on."""
+        """StoreError for another site or journal's folder; the folder belongs to this journal then."""
         self._require_meta(site, frame)
         known, store = known_store(self._mark.values), self.identity().id
         if known and known != store:
@@ -250,10 +243,10 @@ class PostgresJournal(TableWriter, PostgresQueries):
             raise StoreError(folder, problem)
         if not known:
             self._mark.write({STORE: int(store, 16)})
-        self._close_reads()  # a long wait would be too long for it
+        self._close_reads()  # a long wait would outlast it
 
     def _require_same(self) -> None:
-        """StoreError where the database has another journal than before the wait, as while one is restored."""
+        """StoreError if the database has another journal than before the wait, as after a restore."""
         store = known_store(self._mark.values)
         if not _is_there(self._session):
             raise _gone(self.where, f"this server waited for journal {store}", "start it with another --store")
@@ -261,16 +254,13 @@ class PostgresJournal(TableWriter, PostgresQueries):
             raise StoreError(self.where, f"is journal {now} now, and this server waited for {store}; start it again")
 
     def _take_epoch(self, known: int) -> None:
-        """Become the newest writer, which waits for a commit of the last one that is under way.
-
-        known: an epoch that there was, which a database from a backup may not know.
-        """
+        """Become the newest writer; waits for a pending commit. known: an earlier epoch, for restored databases."""
         values = f"epoch = GREATEST(epoch, {known}) + 1, writer = {literal(self._name)}"
         ((self.epoch,),) = self._session.run(f"UPDATE head SET {values} RETURNING epoch")  # noqa: S608 # a number
         log.info("journal taken epoch=%d", self.epoch)
 
     def _open_again(self) -> None:
-        """Go on after the session was lost, if no other server has written meanwhile; else it is tried again later."""
+        """Continue after a lost session unless another server has written, or retry later."""
         self._close_sessions()
         try:
             self._session = WriterSession(self._url, self.where, self._on_loss)
@@ -300,7 +290,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._note_mark()
 
     def _has_all(self) -> bool:
-        """Whether it is the same journal as before, with all rows that were known."""
+        """Whether it is the same journal, with all known rows."""
         if self.identity().id != known_store(self._mark.values) or super().state().row < self._committed:
             return False
         is_archived = self._committed <= self.archived_row
@@ -318,8 +308,8 @@ class PostgresJournal(TableWriter, PostgresQueries):
         raise FencedError(self.where, why)
 
     def _on_loss(self) -> None:
-        """Look whether another server has taken over: the writer itself may have nothing to do."""
-        if not self.epoch:  # it waits for its turn
+        """Look for a take-over, because the writer itself may be idle."""
+        if not self.epoch:  # waiting for its turn
             return
         with suppress(psycopg.Error), connect(self._url, "lost", target_session_attrs="read-write") as db:
             ((epoch, writer),) = db.execute(_WHOSE).fetchall()
@@ -335,7 +325,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._forget_puts()
 
     def _compare(self) -> None:
-        """Compare what there is with the mark, and name what is missing."""
+        """Compare with the mark, and note what is missing."""
         present = marked(self._row, self._newest, self.watermarks())
         if shortfall := compare(traces_of(self._mark.values, self._mark.path), present):
             self.note_shortfall(shortfall)
@@ -344,7 +334,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
     def _note_mark(self) -> None:
         present = marked(self._row, self._newest, self.watermarks())
         store, checksum = int(self.identity().id, 16), self.row_checksum(self._row) or 0
-        with suppress(OSError):  # it stays behind, which is no alarm, or is compared again
+        with suppress(OSError):  # a mark that lags causes no alarm, or is compared again
             self._mark.replace({**present, STORE: store, EPOCH: self.epoch, CHECKSUM: checksum})
 
     def _close_sessions(self) -> None:

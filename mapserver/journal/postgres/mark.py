@@ -1,4 +1,4 @@
-"""The mark in a server's folder: how far it knows the journal to have been, and which one that was."""
+"""The mark in a server's folder: the journal's identity and known progress."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from protocol.disk.high_water_mark import Traces, read_mark
 from protocol.disk.write_ahead_log import LogScan
 from protocol.errors import StoreError
 
-STORE, EPOCH, CHECKSUM = "store", "epoch", "checksum"  # beside what every mark has: of the journal, its writer, its row
+# besides a common mark's values: store id, epoch, checksum of the last row
+STORE, EPOCH, CHECKSUM = "store", "epoch", "checksum"
 
 
 def traces_in(folder: Path) -> Traces:
-    """What a server's folder says of how far the journal once was; StoreError where that cannot be read."""
+    """Traces of the journal in a server's folder; StoreError if unreadable."""
     return traces_of(_values_in(folder), folder / MARK_FILE)
 
 
 def known_store(values: Mapping[str, int]) -> str:
-    """Id of the store that a mark is of, empty where it names none."""
+    """Store id of a mark, or ""."""
     return f"{values[STORE]:016x}" if values.get(STORE) else ""
 
 
 def store_in(folder: Path) -> str:
-    """Id of the store that a folder is of, empty for none; StoreError where that cannot be read."""
+    """Store id of a folder, or ""; StoreError if unreadable."""
     return known_store(_values_in(folder))
 
 
@@ -36,7 +37,7 @@ def trusted_row(folder: Path, journal: JournalQueries) -> int:
 
 
 def trusted_by(values: Mapping[str, int], journal: JournalQueries) -> int:
-    """See `Journal.trusted_row`, by the values of a mark."""
+    """As `trusted_row`, by a mark's values."""
     row = values.get(ROW, 0)
     is_there = known_store(values) == journal.identity().id and row <= journal.last_row
     is_same = is_there and (row <= journal.archived_row or journal.row_checksum(row) == values.get(CHECKSUM))
@@ -44,7 +45,7 @@ def trusted_by(values: Mapping[str, int], journal: JournalQueries) -> int:
 
 
 def traces_of(values: Mapping[str, int], path: Path) -> Traces:
-    """What a mark tells that is about losses."""
+    """Values of a mark about losses."""
     mark = {name: n for name, n in values.items() if name not in (STORE, EPOCH, CHECKSUM)}
     return Traces(mark, LogScan(), path, b"")
 

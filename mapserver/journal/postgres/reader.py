@@ -1,4 +1,4 @@
-"""What can be read of a journal in PostgreSQL."""
+"""Queries of a journal in PostgreSQL."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ WHERE extent.last_stamp_ns >= %(from_ns)s AND extent.first_stamp_ns <= %(to_ns)s
 _RECEIVED = """SELECT pg_is_in_recovery(), pg_last_wal_receive_lsn()::text,
 EXISTS (SELECT FROM pg_stat_wal_receiver WHERE COALESCE(status, 'streaming') = 'streaming')"""
 _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
-_LOOK_S = 1.0  # a notification may be lost, as one of a server that has ended meanwhile
-_LOOK_AGAIN_S = 0.05  # at a replica, which has no notifications
+_LOOK_S = 1.0  # polling, because notifications may be lost
+_LOOK_AGAIN_S = 0.05  # at a replica, without notifications
 
 
 class PostgresQueries(TableQueries):
-    """What can be read of a journal on a connection of its own, which is opened again once it was lost."""
+    """Queries on a separate connection, reopened when lost."""
 
     schema = SCHEMA
 
@@ -42,7 +42,7 @@ class PostgresQueries(TableQueries):
 
     @property
     def where(self) -> str:
-        """The URL, without its password."""
+        """The URL without password."""
         return self._where
 
     @property
@@ -76,7 +76,7 @@ class PostgresQueries(TableQueries):
             return self._connected().execute(query.replace("?", "%s"), values, binary=True).fetchall()
 
     def _connected(self) -> Connection:
-        """The connection; a new one where the last one was lost."""
+        """The connection, reopened when lost."""
         if self._db is None or self._db.closed:
             self._db = connect(self._url, "reader")
         return self._db
@@ -88,7 +88,7 @@ class PostgresQueries(TableQueries):
         try:
             yield
         finally:
-            with suppress(psycopg.Error, StoreError):  # a connection that is lost has ended it
+            with suppress(psycopg.Error, StoreError):  # a lost connection has ended it
                 self._connected().execute("ROLLBACK")
 
     def _piece(self, after: int, until: int, selection: Selection) -> tuple[list[int], list[Any], bool]:
@@ -113,19 +113,19 @@ class PostgresQueries(TableQueries):
 
 
 def exists(url: str) -> bool:
-    """Whether a database has a journal; StoreError where that cannot be asked."""
+    """Whether a database has a journal; StoreError if unreachable."""
     where = shown(url)
     with readable(where), connect(url, "look") as db:
         return bool(db.execute(f"SELECT to_regclass('{connection.SCHEMA}.meta') IS NOT NULL").fetchall()[0][0])
 
 
 class PostgresReader(PostgresQueries):
-    """See `JournalReader`: of the server that writes, or of one of its replicas."""
+    """See `JournalReader`; of the primary or a replica."""
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
         self._listens: Connection | None = None
-        self._noted: tuple[Any, float] | None = None  # how far a replica had received it, and when
+        self._noted: tuple[Any, float] | None = None  # what a replica had received, and when
         self._complete_s = -math.inf
         try:
             meta = self._meta()
@@ -140,9 +140,9 @@ class PostgresReader(PostgresQueries):
         return bool(self._query("SELECT pg_is_in_recovery()")[0][0])
 
     def complete_s(self) -> float:
-        """See `JournalReader`: of a replica, when it had received what it has replayed by now.
+        """See `JournalReader`; for a replica, when it had received what is replayed now.
 
-        One whose link to the primary hangs notices that after its `wal_receiver_timeout`.
+        A hanging link to the primary is noticed after `wal_receiver_timeout`.
         """
         now_s = time.monotonic()
         ((is_replica, received, streams),) = self._query(_RECEIVED)
@@ -158,7 +158,7 @@ class PostgresReader(PostgresQueries):
         return self._complete_s
 
     def follow(self, known: JournalState, timeout_s: float) -> JournalState:
-        """See `JournalReader`: waits for a notification, and looks by itself once a second."""
+        """See `JournalReader`; by notification, and polling every second."""
         end_s = time.monotonic() + timeout_s
         with readable(self._where):
             notified = self._listen()
@@ -170,7 +170,7 @@ class PostgresReader(PostgresQueries):
         return state
 
     def _listen(self) -> bool:
-        """Whether notifications come; those before this are passed over, since the state is looked at after it."""
+        """Whether notifications come; earlier ones are unnecessary, because the state is read afterwards."""
         db = self._connected()
         if self._listens is not db:
             ((is_replica,),) = db.execute("SELECT pg_is_in_recovery()").fetchall()

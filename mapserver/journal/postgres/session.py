@@ -1,15 +1,12 @@
-"""The one session that may write a journal in PostgreSQL: it holds the journal's lock, and is kept awake.
+"""The session that may write a journal in PostgreSQL: it holds the lock and is kept alive.
 
-A holder that hangs must lose the lock with nobody's help. So the database ends a session that is idle for HANGS_S, and
-a thread of the holder, which hangs with it, says something more often than that. This needs two things. All that
-the session ever sends is single messages of the simple query protocol, each a transaction of its own: whoever stops in
-the middle of one leaves a session that is idle for the database, while between the messages of a pipeline or of a
-prepared statement no time limit of PostgreSQL 15 runs. And nothing large is read on it: a database that waits until its
-answer is taken is not idle either.
+A hanging holder must lose the lock. So the database ends sessions idle for HANGS_S, and a thread, which hangs with its
+process, sends signs of life. The session sends only single messages of the simple query protocol, each a transaction:
+interrupted anywhere, it counts as idle, whereas PostgreSQL 15 has no timeout inside pipelines or prepared statements.
+It reads nothing large: a database waiting for its client is not idle.
 
-A network that swallows bytes, with something in it that acknowledges them, never fails by itself. So a sign of life
-that has no answer for ANSWER_S gives the session up. A commit may wait longer, for a replica; then the holder looks by
-another connection whether it was replaced.
+A network that acknowledges but drops bytes never fails, so a sign of life unanswered for ANSWER_S ends the session. A
+commit may wait longer, for a replica; meanwhile another connection looks for a take-over.
 """
 
 from __future__ import annotations
@@ -29,13 +26,13 @@ from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.postgres.connection import REPLICAS, connect, line, replica_of
 from protocol.errors import StoreError
 
-HANGS_S = 1.5  # a holder that says nothing for so long has lost the lock
-AWAKE_S = 0.3  # between two signs of life
-ANSWER_S = 2 * HANGS_S  # for a sign of life; the database answers at once
+HANGS_S = 1.5  # after which a silent holder loses the lock
+AWAKE_S = 0.3  # between signs of life
+ANSWER_S = 2 * HANGS_S  # timeout of a sign of life, normally answered at once
 LOOK_TURNS = 10  # signs of life between two looks for replicas
-LOCK = 0x517E62D1  # of journals; advisory locks are those of one database
+LOCK = 0x517E62D1  # of journals; advisory locks are per database
 FENCED = "SG001"  # SQLSTATE of `advance`
-OLDEST = 140_000  # before version 14 no session ends for being idle
+OLDEST = 140_000  # older versions do not end idle sessions
 SET_UP = f"""
 SET idle_session_timeout = '{HANGS_S:g}s'; SET idle_in_transaction_session_timeout = '{HANGS_S:g}s';
 SET statement_timeout = 0; SET lock_timeout = 0;
@@ -49,18 +46,18 @@ log = logging.getLogger("mapserver.journal.postgres.session")
 
 
 class WriterSession:
-    """A session for the lock and for writes; for any thread, one at a time.
+    """A session for the lock and writes; thread-safe.
 
-    lost: why it cannot be used any more, empty while it can. replica: see `JournalQueries`.
+    lost: why it is unusable, or "". replica: see `JournalQueries`.
     """
 
     def __init__(self, url: str, where: str, lost: Callable[[], None] = lambda: None) -> None:
-        """lost: is called, on a thread of its own, again and again while the session is lost or has no answer."""
+        """lost: called repeatedly on another thread, while the session is lost or unanswered."""
         self.lost, self.replica = "", "none"
         self._where, self._on_loss = where, lost
         self._turn, self._ending = threading.Lock(), threading.Event()
         self._warning = ""
-        self._asked_s: float | None = None  # since when an answer is waited for
+        self._asked_s: float | None = None  # start of the pending request
         self._is_sign = False
         try:
             self._db = connect(url, "writer", target_session_attrs="read-write")
@@ -74,7 +71,7 @@ class WriterSession:
         except psycopg.Error as error:
             is_lost = self._db.closed
             self._db.close()
-            if is_lost:  # as where the database goes down: who waits for it goes on waiting
+            if is_lost:  # the database is shutting down: the caller may wait
                 raise UnwrittenError(where, line(error)) from None
             raise StoreError(where, f"is no usable journal: {line(error)}") from None
         except StoreError:
@@ -85,14 +82,14 @@ class WriterSession:
         threading.Thread(target=self._watch, name="journal watch", daemon=True).start()
 
     def take_lock(self) -> bool:
-        """Become the journal's writer; whether no other session is."""
+        """Try to become the writer; False if another session is."""
         ((taken,),) = self.run(f"SELECT pg_try_advisory_lock({LOCK})")
         return bool(taken)
 
     def run(self, query: str | bytes) -> list[tuple[Any, ...]]:
-        """Run statements as one transaction; what the last one answers.
+        """Run statements as one transaction; returns the last answer.
 
-        UnwrittenError where it fails, unsure where the session was lost with the answer.
+        UnwrittenError on failure, unsure if the session was lost.
         """
         with self._turn:
             if self.lost:
@@ -113,30 +110,30 @@ class WriterSession:
                 raise UnwrittenError(self._where, line(error), unsure=is_lost) from None
             finally:
                 self._asked_s = None
-            if self._warning:  # of a commit that was not waited for until the replica had it
+            if self._warning:  # of a commit that did not wait for its replica
                 self._lose(self._warning)
                 raise UnwrittenError(self._where, self.lost, unsure=True)
             return answer
 
     def cut(self) -> None:
-        """Have whoever waits for an answer stop that: the session is lost. For any thread."""
+        """Interrupt a pending answer; the session is lost. Thread-safe."""
         with suppress(OSError, psycopg.Error), socket.socket(fileno=os.dup(self._db.fileno())) as link:
             link.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Let go of the lock."""
-        self._ending.set()  # its threads end by themselves
+        """Release the lock."""
+        self._ending.set()  # ends its threads
         in_time = threading.Timer(ANSWER_S, self.cut)
         in_time.daemon = True
         in_time.start()
         with self._turn:
             with suppress(psycopg.Error):
-                self._db.execute("SELECT pg_advisory_unlock_all()")  # now, not once the database sees that it is closed
+                self._db.execute("SELECT pg_advisory_unlock_all()")  # at once, before the database notices the close
             self._lose("it is closed")
         in_time.cancel()
 
     def _require_settings(self) -> None:
-        """StoreError where what it acknowledges may be lost."""
+        """StoreError if acknowledged data might be lost."""
         ((version, fsync, pages, commit),) = self._db.execute(_SETTINGS).fetchall()
         if version < OLDEST:
             raise StoreError(self._where, f"is PostgreSQL {version // 10_000}; a journal needs version 14 or newer")
@@ -156,7 +153,7 @@ class WriterSession:
         while not self._ending.wait(AWAKE_S):
             if self.lost:
                 self._on_loss()
-            elif self._turn.acquire(blocking=False):  # else it is in use, or a batch is waited for
+            elif self._turn.acquire(blocking=False):  # otherwise in use
                 turns += 1
                 try:
                     self._say_something(look=turns % LOOK_TURNS == 0)
@@ -164,7 +161,7 @@ class WriterSession:
                     self._turn.release()
 
     def _watch(self) -> None:
-        """Notice that no answer comes."""
+        """Notice missing answers."""
         while not self._ending.wait(AWAKE_S):
             asked_s = self._asked_s
             if asked_s is None or time.monotonic() - asked_s < ANSWER_S:

@@ -1,4 +1,4 @@
-"""The tables of a journal in PostgreSQL, how they are made, and statements with their values in them.
+"""Tables of a journal in PostgreSQL, their creation, and statements with literal values.
 
 A transaction is one message (see session.py).
 """
@@ -12,12 +12,11 @@ from psycopg.sql import quote
 from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
 from mapserver.journal.table_writer import new_meta
 
-MAKING = 0x517E62D2  # an advisory lock for as long as tables are made
+MAKING = 0x517E62D2  # advisory lock during creation
 SCHEMA = 4
-CHANNEL = "sitegrid_journal"  # of notifications, one per database
-# `head` has one line, which every commit changes: rows are numbered by it, so that they are dense and in the order of
-# their commits. Numbers of a sequence are not, and whoever asks for what follows the last one he has seen loses rows.
-# `writer` is a name that the epoch's writer drew: it knows by that whose an epoch is.
+CHANNEL = "sitegrid_journal"  # of notifications, per database
+# Every commit updates the single line of `head`, which numbers rows densely in commit order; a sequence does not, and
+# readers would lose rows. `writer`: a name by which an epoch's writer recognises it.
 TABLES = """
 CREATE TABLE meta (key text PRIMARY KEY, value text NOT NULL, crc32 bigint NOT NULL);
 CREATE TABLE head (
@@ -53,7 +52,7 @@ END $$;
 
 
 def creation(site: str, frame: str, descends: Iterable[str] = ()) -> str:
-    """A statement that makes the tables where there are none; of several servers that run it at once, one does."""
+    """Statement that creates missing tables; of concurrent servers one does."""
     meta = insert("meta", new_meta(SCHEMA, site, frame, descends))
     return f"""DO $making$
 BEGIN
@@ -68,13 +67,13 @@ END $making$"""  # noqa: S608 # constants, and literals
 
 
 def insert(table: str, lines: Iterable[tuple[object, ...]], more: str = "") -> str:
-    """One statement for all lines; empty without any."""
+    """One statement for all lines; "" for none."""
     values = ",".join(f"({','.join(map(literal, line))})" for line in lines)
     return f"INSERT INTO {table} VALUES {values} {more}" if values else ""  # noqa: S608 # literals, a constant table
 
 
 def literal(value: object) -> str:
-    """A value of plain type as PostgreSQL reads it, where strings conform to the standard."""
+    """A plain value as a PostgreSQL literal, with standard-conforming strings."""
     if isinstance(value, bytes):
         return f"'\\x{value.hex()}'"
     return quote(value) if isinstance(value, str) else repr(value)  # numbers

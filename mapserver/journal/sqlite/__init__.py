@@ -1,1 +1,1 @@
-"""The journal of one server: a SQLite file in the folder of its store."""
+"""The journal of one server: a SQLite file in its store."""

@@ -1,9 +1,8 @@
-"""The journal: what machines sent, in SQLite, committed with FULL sync before it is acknowledged. It is the truth.
+"""The journal in SQLite, committed with FULL sync before acknowledgement. It is the truth.
 
-One journal row is one admitted batch. Row and watermark are written in one transaction, so that exactly-once is
-decided here. `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulated power cuts, FULL none
-(docs/how-the-map-comes-about.md). Rows up to `archived_row` have moved to Parquet files (archive.py); history.py reads
-both as one.
+A row is an admitted batch; its watermark in the same transaction gives exactly-once. `synchronous=NORMAL` lost
+acknowledged rows in 398 of 400 simulated power cuts, FULL none (docs/how-the-map-comes-about.md). Rows up to
+`archived_row` are in Parquet files (archive.py).
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ from protocol.disk.high_water_mark import HighWaterMark, Traces, look_beside, ma
 from protocol.errors import StoreError
 from protocol.files import make_private
 
-SPARE = 0.25  # share of free pages above which a file is made smaller
+SPARE = 0.25  # share of free pages above which the file shrinks
 
 
 class SqliteJournal(TableWriter, SqliteQueries):
-    """See `Journal`. StoreError where anything in it is damaged (`check`)."""
+    """See `Journal`. StoreError for any damage (`check`)."""
 
     fenced = ""
 
     def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = ()) -> None:
-        """descends: ids of the stores that a new one is made from."""
+        """descends: ids of the stores a new one is made from."""
         self.path, self._row = path, 0
         self._changed: dict[str, int] = {}  # by the open transaction, for the mark
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,7 +49,7 @@ class SqliteJournal(TableWriter, SqliteQueries):
                 make_private(path)
                 self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
                 opened.callback(self._db.close)
-                self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")  # only a new file takes it
+                self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")  # affects only new files
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute(f"PRAGMA journal_size_limit={64 * 2**20}")
@@ -69,16 +68,16 @@ class SqliteJournal(TableWriter, SqliteQueries):
 
     @property
     def last_row(self) -> int:
-        """The last row, also of the open transaction."""
+        """The last row, including the open transaction."""
         return self._row
 
     @property
     def trusted_row(self) -> int:
-        """See `Journal`: the folder is the journal's own."""
+        """See `Journal`; the folder is the journal's own."""
         return self._row
 
     def begin(self) -> None:
-        """Open a transaction; rows appended from here on are one group commit."""
+        """Open a transaction, a group commit."""
         self._write("BEGIN IMMEDIATE")
 
     def _insert(self, row: int, record: bytes, extent: Line) -> None:
@@ -94,14 +93,14 @@ class SqliteJournal(TableWriter, SqliteQueries):
         self._changed[spool_name(machine, spool_id)] = watermark.seq
 
     def commit(self) -> None:
-        """Commit to disk; only then may anything be acknowledged."""
+        """Commit to disk, before anything is acknowledged."""
         self._write("COMMIT")
         if self._changed:
             self._mark.write({ROW: self._row, **self._changed})
             self._changed.clear()
 
     def rollback(self) -> None:
-        """Give up the open transaction and return to what is on disk."""
+        """Abort the open transaction and return to what is on disk."""
         if self._db.in_transaction:
             self._write("ROLLBACK")
         self._return_to_disk()
@@ -118,12 +117,12 @@ class SqliteJournal(TableWriter, SqliteQueries):
             return self._last_event()
 
     def note_shortfall(self, shortfall: Shortfall) -> None:
-        """See `Journal`; in the file itself, as further damage of the log would take it away."""
+        """See `Journal`; checkpointed, as damage to the log could remove it."""
         super().note_shortfall(shortfall)
         self._write("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
-        """Have a new journal go on after an archive with rows up to `row`, and spools up to these watermarks."""
+        """Continue a new journal after an archive's rows and watermarks."""
         with self._transaction():
             self._write("INSERT INTO sqlite_sequence VALUES ('journal', ?)", (row,))
             self._put_meta("archived_row", row)
@@ -132,10 +131,7 @@ class SqliteJournal(TableWriter, SqliteQueries):
                 self.put_watermark(*spool, watermark)
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
-        """Remove the next rows up to `until`, which are archived, and commit; returns the new `archived_row`.
-
-        most: how many at most, so that batches need not wait long; call it again until `until` is reached.
-        """
+        """See `Journal`."""
         archived = self.archived_row
         last = max(archived, min(until, archived + most, self.last_row))
         with self._transaction():
@@ -145,22 +141,19 @@ class SqliteJournal(TableWriter, SqliteQueries):
         return last
 
     def shrink(self, most_pages: int = 100) -> int:
-        """Give free pages back to the disk where more than SPARE of the file is free; returns how many.
-
-        Fewer are kept for the rows to come.
-        """
+        """Return free pages beyond the share SPARE to the disk; returns their number."""
         pages, free = (self._number(f"PRAGMA {name}") for name in ("page_count", "freelist_count"))
         spare = min(most_pages, free - int(SPARE * pages))
         if spare <= 0:
             return 0
         try:
-            self._db.executescript(f"PRAGMA incremental_vacuum({spare})")  # `execute` would stop after the first page
+            self._db.executescript(f"PRAGMA incremental_vacuum({spare})")  # `execute` would stop after one page
         except sqlite3.Error as error:
             raise UnwrittenError(self.path, str(error)) from None
         return free - self._number("PRAGMA freelist_count")
 
     def close(self) -> None:
-        """Fold the write-ahead log into the file and close."""
+        """Checkpoint the write-ahead log and close."""
         self._write("PRAGMA wal_checkpoint(TRUNCATE)")
         self._db.close()
         self._mark.close()
@@ -190,24 +183,24 @@ class SqliteJournal(TableWriter, SqliteQueries):
             meta = new_meta(SCHEMA, site, frame, descends)
             self._db.executemany("INSERT INTO meta VALUES (?, ?, ?)", meta)
             self._db.execute("COMMIT")
-            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # no damage of a log takes the store's id away
+            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # protects the store's id from damage of the log
         self._require_meta(site, frame)
 
     def _compare(self, traces: Traces) -> None:
-        """Compare what there is with the mark and the log beside it, and name what is missing."""
+        """Compare with the mark and the log, and note what is missing."""
         present = marked(self.last_row, self._last_event(), self.watermarks())
         if shortfall := compare(traces, present):
-            with suppress(OSError):  # a full disk: the shortfall is named all the same
+            with suppress(OSError):  # a full disk; the shortfall is noted anyway
                 traces.keep_log(self.last_row)
             self._require_agreement()
             self.note_shortfall(shortfall)
-        with suppress(OSError):  # it stays behind, which is no alarm, or is compared again
+        with suppress(OSError):  # a mark that lags causes no alarm, or is compared again
             self._mark.replace(marked(self.last_row, self._last_event(), self.watermarks()))
 
     def _require_agreement(self) -> None:
-        """StoreError where pages of different times are in the file, as a damaged log may leave them.
+        """StoreError for pages of different times, as damaged logs leave.
 
-        A watermark behind its rows would take their samples once more.
+        A watermark behind its rows would admit samples twice.
         """
         ((verdict,), *_) = self._query("PRAGMA integrity_check(1)")
         reached = all(row.first_seq + len(row.rows) - 1 <= self._seq_of(row) for row in self.read(self.archived_row))

@@ -1,4 +1,4 @@
-"""The tables of a journal in SQLite, and what can be read of them, by its owner as by any other thread or process."""
+"""Tables and queries of a journal in SQLite, for its owner and other readers."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ CREATE TABLE events (
 );
 """
 _READ_ALL = "SELECT row, record FROM journal WHERE row > :after AND row <= :until ORDER BY row"
-# LEFT JOIN keeps SQLite from walking the journal first, and shows a row that is not there.
+# LEFT JOIN reads extents first, and shows missing rows.
 _READ_SOME = """SELECT row, record FROM extent LEFT JOIN journal USING (row)
 WHERE extent.last_stamp_ns >= :from_ns AND extent.first_stamp_ns <= :to_ns
     AND west_m <= :east_m AND east_m >= :west_m AND south_m <= :north_m AND north_m >= :south_m
     AND row > :after AND row <= :until ORDER BY row"""
-_LOOK_S = 0.02  # between two looks whether the file has changed, which cost 10 us
+_LOOK_S = 0.02  # between looks at the file's version, of 10 us
 _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
 
 
 class SqliteQueries(TableQueries):
-    """What can be read of a journal, on its owner's connection as on a reader's; see `JournalQueries`."""
+    """Queries on the owner's or a reader's connection; see `JournalQueries`."""
 
     schema, replica = SCHEMA, "none"
     path: Path
@@ -65,7 +65,7 @@ class SqliteQueries(TableQueries):
 
     @property
     def last_row(self) -> int:
-        """See `JournalQueries`; also where all rows are archived."""
+        """See `JournalQueries`; valid even if all rows are archived."""
         return self._number("SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'journal'")
 
     @property
@@ -78,7 +78,7 @@ class SqliteQueries(TableQueries):
         return JournalState(self._meta_number("epoch"), self.last_row, self._last_event())
 
     def _last_event(self) -> int:
-        return self._meta_number("event")  # and not the greatest one, which may have lost those after it
+        return self._meta_number("event")  # not the greatest event, because later ones may be lost
 
     def _meta_number(self, key: str) -> int:
         return self._number(f"SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = '{key}'")  # noqa: S608 # a constant
@@ -89,7 +89,7 @@ class SqliteQueries(TableQueries):
         try:
             yield
         finally:
-            if self._db.in_transaction:  # SQLite itself ends it where the disk fails
+            if self._db.in_transaction:  # SQLite ends it on disk errors
                 self._db.execute("ROLLBACK")
 
     def _query(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
@@ -99,7 +99,7 @@ class SqliteQueries(TableQueries):
             raise StoreError(self.path, f"cannot be read: {error}") from None
 
     def _piece(self, after: int, until: int, selection: Selection) -> tuple[list[int], list[Any], bool]:
-        """Numbers and records of the next rows, and whether there are no more."""
+        """See `TableQueries`."""
         span: dict[str, float] = {"after": after, "until": until}
         if selection.everywhere:
             query, values = _READ_ALL, span
@@ -116,14 +116,14 @@ class SqliteQueries(TableQueries):
                 numbers += more
                 records += some
                 size += size_of(some)
-            cursor.close()  # which ends the transaction
+            cursor.close()  # ends the transaction
         except sqlite3.Error as error:
             raise StoreError(self.path, f"cannot be read: {error}") from None
         return numbers, records, size < BYTES_AT_ONCE
 
 
 class SqliteReader(SqliteQueries):
-    """A read-only connection for threads other than the owner's, also while a server writes; see `JournalReader`."""
+    """A read-only connection for other threads, while a server may write; see `JournalReader`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -146,7 +146,7 @@ class SqliteReader(SqliteQueries):
         return time.monotonic()
 
     def follow(self, known: JournalState, timeout_s: float) -> JournalState:
-        """See `JournalReader`: looks again and again, since SQLite tells nobody."""
+        """See `JournalReader`; by polling, because SQLite does not notify."""
         end_s, state, version = time.monotonic() + timeout_s, self.state(), self._version()
         while state == known and time.monotonic() < end_s:
             time.sleep(_LOOK_S)
@@ -155,26 +155,26 @@ class SqliteReader(SqliteQueries):
         return state
 
     def copy_to(self, path: Path) -> None:
-        """Copy all of it, as it is at one commit, into a new file, also while a server writes; StoreError."""
+        """Copy one committed state into a new file, while a server may write; StoreError."""
         try:
             make_private(path)
             with closing(sqlite3.connect(path)) as copy:
-                self._db.backup(copy)  # all pages at once: a writer goes on meanwhile, in the write-ahead log
+                self._db.backup(copy)  # in one step, while a writer continues in the log
                 copy.execute("PRAGMA synchronous=FULL")
-                copy.execute("PRAGMA journal_mode=DELETE")  # so that the copy is this one file
+                copy.execute("PRAGMA journal_mode=DELETE")  # makes the copy a single file
             with path.open("rb") as file:
                 os.fsync(file.fileno())
         except (sqlite3.Error, OSError) as error:
             raise StoreError(path, f"cannot be written: {error}") from None
 
     def require_sound(self) -> None:
-        """StoreError where SQLite finds damage in the file; `check` and reading rows find what it cannot."""
+        """StoreError if SQLite finds damage; `check` and row reads find the rest."""
         ((verdict,), *_) = self._query("PRAGMA integrity_check(1)")
         if verdict != "ok":
             raise self._damaged(f"the file ({verdict})")
 
     def _version(self) -> int:
-        """A number that is another one once a server has committed."""
+        """Changes when a server commits."""
         return self._number("PRAGMA data_version")
 
     def close(self) -> None:
