@@ -1,15 +1,13 @@
-"""One writer for a site: a server takes batches only while no other one answers that it does.
+"""One writer for a site: a server takes batches only while no other one claims to write.
 
-Of two servers with two stores each would take samples that the other lacks. So a server asks all others on the key
-`writer`, at its start, after each reconnection and once a second, and answers them. Who writes comes before who asks;
-of two alike the earlier one, then by chance. Whoever finds another one before itself ends.
+Two servers with separate stores would each lack the other's samples. So a server asks others on the key `writer` at its
+start, after reconnections and every second, and answers them. Writers precede askers, then the earlier one wins, then
+chance; whoever finds a predecessor ends.
 
-Servers of one shared journal let each other be: its database says whose turn it is. But two databases may hold the same
-journal, as one that was restored beside the first, or a replica that was promoted while the old primary lives. Then
-two servers both take batches, each by its own database; the one with the lower epoch ends, and none begins whose
-database does not know of an epoch that another server writes with.
+Servers of one shared journal coexist: its database decides. But two databases may hold it (a restored copy, an old
+primary). Then the server with the lower epoch ends, and none starts whose database lacks an epoch in use.
 
-A query that must be answered, and no token: a server that was killed never keeps its successor waiting (decision 0005).
+A query, not a token: a killed server must not block its successor (decision 0005).
 """
 
 from __future__ import annotations
@@ -28,21 +26,20 @@ from protocol.wire import keys
 from protocol.wire.fields import take
 from protocol.wire.owners import ANSWER_S, EVERY_OTHER, Owner, decode_owner, encode_owner, this_process
 
-ROUNDS = 2  # without an answer: the first question after a reconnection may find nobody (Zenoh issue 2767)
+ROUNDS = 2  # rounds without an answer; the first after a reconnection may reach nobody (Zenoh issue 2767)
 BETWEEN_S = 0.25
-WATCH_S = 1.0  # between two questions of a writer
-TAKE_OVER_S = 60.0  # for the other one to commit, write its snapshot, and end
+WATCH_S = 1.0  # between a writer's questions
+TAKE_OVER_S = 60.0  # for the other server to commit, write its snapshot and end
 _TWO = "two databases have this journal: a restored copy or an old primary has to go"
 log = logging.getLogger("mapserver.claim")
 
 
 @dataclass(frozen=True)
 class Claimant:
-    """A server that writes for a site, or asks whether it may.
+    """A server that writes for a site, or asks to.
 
-    store: id of its store, empty where it has none yet. shared: whether servers take turns in writing its journal; of
-    those with one journal its database says whose turn it is. epoch: that it writes a shared journal with, 0 while it
-    waits for its turn.
+    store: its id, "" for none yet. shared: several servers share its journal. epoch: of a shared journal's writer, 0
+    while waiting.
     """
 
     owner: Owner
@@ -52,11 +49,11 @@ class Claimant:
     epoch: int = 0
 
     def has_journal_of(self, other: Claimant) -> bool:
-        """Whether both have one journal, which only one of them may write at a time."""
+        """Whether both share one journal."""
         return self.shared and other.shared and self.store != "" and self.store == other.store
 
     def precedes(self, other: Claimant) -> bool:
-        """Whether this one goes on, and the other one ends."""
+        """Whether this one continues and the other ends."""
         if self.has_journal_of(other):
             both_write = self.epoch > 0 and other.epoch > 0
             return both_write and (-self.epoch, self.owner) < (-other.epoch, other.owner)
@@ -67,10 +64,10 @@ class Claimant:
 
 
 class WriterClaim:
-    """The claim of one server. All but `acquire` is for any thread.
+    """The claim of one server; thread-safe, except for `acquire`.
 
-    held: whether it may take batches now. ended: why it has to end, empty while it need not; superseded: the same where
-    that is another server with the same journal. epoch: see `Claimant`; it may change.
+    held: it may take batches. ended: why it must end, or ""; superseded: the same, by a server of the same journal.
+    epoch: see `Claimant`; it may change.
     """
 
     def __init__(
@@ -82,9 +79,9 @@ class WriterClaim:
         shared: bool = False,
         known_epoch: Callable[[], int] = lambda: 0,
     ) -> None:
-        """store: id of the store, empty where it is to be made: it may be set later. shared: see `Claimant`.
+        """store: its id, "" if not created yet. shared: see `Claimant`.
 
-        known_epoch: the newest one that this server's database knows; StoreError where that cannot be asked.
+        known_epoch: the newest in this server's database; StoreError if unreachable.
         """
         self.store, self.shared, self.held, self.ended, self.superseded = store, shared, False, "", ""
         self.epoch: Callable[[], int] = lambda: 0
@@ -92,18 +89,15 @@ class WriterClaim:
         self._session, self._site, self._key = session, site, keys.writer(site)
         self._owner, self._writes = this_process(), False
         self._behind_router = bool(session.info.routers_zid())
-        self._rounds = 0  # without another one, since the link to the router changed
+        self._rounds = 0  # without a rival, since the last change of the router's link
         self._changed, self._ending = threading.Event(), False
         self._watch = threading.Thread(target=self._run, name="claim", daemon=True)
-        # Declared before anybody is asked: of two servers that start at once, one at least is heard by the other.
+        # declared before asking: of two simultaneous starts, one hears the other
         self._answer = session.declare_queryable(self._key, self._on_query)
         self._links = session.info.declare_transport_events_listener(self._on_link)
 
     def acquire(self, *, take_over: bool = False) -> None:
-        """Become the site's writer; LinkError if another one is, or becomes it.
-
-        take_over: have another one end instead, and wait until it has.
-        """
+        """Become the site's writer; LinkError if another one is. take_over: make another one end, and wait for it."""
         end_s = time.monotonic() + TAKE_OVER_S
         while self._rounds < ROUNDS:
             rival = self._ask(take_over=take_over)
@@ -115,12 +109,12 @@ class WriterClaim:
         self._watch.start()
 
     def require(self) -> None:
-        """LinkError where this server has to end."""
+        """LinkError if this server must end."""
         if self.ended:
             raise LinkError(f"site {self._site}", self.ended)
 
     def close(self) -> None:
-        """Let another one write."""
+        """Release the claim."""
         self._ending = True
         self._changed.set()
         if self._watch.is_alive():
@@ -133,7 +127,7 @@ class WriterClaim:
             self._changed.wait(WATCH_S if self.held else BETWEEN_S)
             self._changed.clear()
             if self._behind_router and not self._session.info.routers_zid():
-                continue  # nobody could be asked
+                continue  # nobody could answer
             if rival := self._ask():
                 self._end_for(rival)
             elif not self.held:
@@ -141,7 +135,7 @@ class WriterClaim:
                 self._writes = self.held = self._rounds >= ROUNDS
 
     def _ask(self, *, take_over: bool = False) -> Claimant | None:
-        """The first of the others that come before this one."""
+        """The first of its predecessors."""
         question = self._encoded(take_over=take_over)
         replies = self._session.get(self._key, payload=question, timeout=ANSWER_S, **EVERY_OTHER)
         others = [other for reply in replies if (other := _claimant(reply)) and other.owner != self._owner]
@@ -158,12 +152,12 @@ class WriterClaim:
         return encode_owner(self._owner, **words, **more)
 
     def _is_elsewhere(self, other: Claimant) -> bool:
-        """Whether another server writes this server's journal in another database, while this one does not yet."""
+        """Whether another server writes this journal in another database, while this one waits."""
         if self.epoch() or not (other.epoch and other.has_journal_of(self._this)):
             return False
         try:
             return other.epoch > self._known_epoch()
-        except StoreError:  # it is away: nobody begins in it now
+        except StoreError:  # away: nobody starts in it now
             return False
 
     def _problem(self, rival: Claimant) -> str:
@@ -190,15 +184,15 @@ class WriterClaim:
         with query:
             try:
                 asker, table = _decoded(query.payload)
-                waits = not self.epoch() and self._this.has_journal_of(asker)  # it is no obstacle
+                waits = not self.epoch() and self._this.has_journal_of(asker)  # a waiting server is no obstacle
                 if take(table, "take_over", bool, default=False) and self._writes and not (waits or self.ended):
                     self._end(f"another map server takes over site {self._site}, {asker.owner}")
-            except MessageError as error:  # an answer is owed all the same
+            except MessageError as error:  # an answer is owed anyway
                 log.warning("claim unread error=%r", str(error))
             query.reply(query.key_expr, self._encoded())
 
     def _on_link(self, event: zenoh.TransportEvent) -> None:
-        """Nothing is certain once the link to the router has changed: another one may have started meanwhile."""
+        """Renew the claim, because another server may have started meanwhile."""
         if event.transport.whatami == zenoh.WhatAmI.ROUTER:
             self.held, self._writes, self._rounds = False, False, 0
             self._changed.set()
@@ -212,7 +206,7 @@ def _claimant(reply: zenoh.Reply) -> Claimant | None:
 
 
 def _decoded(payload: zenoh.ZBytes | None) -> tuple[Claimant, dict[str, Any]]:
-    """A claimant, and all that it says."""
+    """A claimant, and its whole table."""
     owner, table = decode_owner(payload.to_bytes() if payload else b"")
     named = take(table, "store", str), take(table, "writes", bool), take(table, "shared", bool)
     return Claimant(owner, *named, take(table, "epoch", int)), table

@@ -13,11 +13,10 @@ from protocol.config import require_positive
 
 @dataclass(frozen=True)
 class StoreConfig:
-    """What is kept on disk beside the journal.
+    """What is stored besides the journal.
 
-    snapshot_s: a snapshot of the grid is written so often. archive_after_h: rows of a journal in SQLite move to Parquet
-    files once they are so old, 0 for never. checkpoints_gb: so much room have checkpoints, which make maps of the past
-    quick; 0 for none.
+    snapshot_s: interval of grid snapshots. archive_after_h: age at which rows of a SQLite journal move to Parquet, 0
+    for never. checkpoints_gb: room for checkpoints, which speed up past maps; 0 for none.
     """
 
     snapshot_s: float = 60.0
@@ -33,10 +32,10 @@ class StoreConfig:
 
 @dataclass(frozen=True)
 class TrustConfig:
-    """What follows from the audit of machines.
+    """Consequences of the machines' audit.
 
-    judge_s: machines are judged so often. exclude: whether machines that contradict all others are excluded from the
-    map, or only named.
+    judge_s: interval of judgements. exclude: remove machines that contradict all others from the map, or only report
+    them.
     """
 
     judge_s: float = 30.0
@@ -48,9 +47,9 @@ class TrustConfig:
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """What follows from the calibration of machines.
+    """Consequences of the machines' calibration.
 
-    automatic: whether samples are corrected by what the server finds, or by nothing until a person asks.
+    automatic: apply the server's corrections, or none without a person's request.
     """
 
     automatic: bool = True
@@ -58,7 +57,7 @@ class CalibrationConfig:
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """All options, one table per component."""
+    """All options, by component."""
 
     store: StoreConfig = field(default_factory=StoreConfig)
     fold: FoldConfig = field(default_factory=FoldConfig)

@@ -1,6 +1,6 @@
-"""The map server's edge to Zenoh: a queryable for batches, one for map queries, one for commands; events of changes.
+"""The map server's edge to Zenoh: batches, map queries, commands, and events of changes.
 
-Callbacks only move bytes to the writer's queue or to other threads: a callback that works stalls the session.
+Callbacks only move bytes: one that works stalls the session.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_reply
 from protocol.wire.messages import Ack, Refused
 
-COMMAND_THREADS = 8  # a command waits for its map; those given meanwhile are kept at once, and folded together
-MOST_COMMANDS = 16  # that wait or are in work
-SignReply = Callable[[str, bytes, bytes], bytes]  # key expression, batch and reply to signature
+COMMAND_THREADS = 8  # a command waits for its map; others are stored meanwhile, and folded together
+MOST_COMMANDS = 16  # waiting or in work
+SignReply = Callable[[str, bytes, bytes], bytes]  # arguments: key expression, batch, reply to sign
 log = logging.getLogger("mapserver")
 
 
 class Server:
-    """Serves one site over two open sessions until closed. answers: the map, for callers in this process."""
+    """Serves one site over two open sessions. answers: the map, for this process."""
 
     def __init__(
         self,
@@ -60,13 +60,11 @@ class Server:
         take_over: bool = False,
         standing_by: Callable[[bool], None] = lambda _: None,
     ) -> None:
-        """ingest: for batches alone, since an answer that nobody takes holds up its whole link. readers: for all else.
+        """ingest: only for batches, because an unread answer blocks its link. readers: for all else.
 
-        verify: of signed batches, see Store; without it signatures are not asked for. sign: makes the
-        signature that goes beside the reply to a signed batch. take_over: have another server of
-        the site end, where there is one; otherwise a LinkError says so. standing_by: is called again and again while
-        another server writes a journal that is shared, with whether this one has folded all that there is; what it
-        raises ends the wait.
+        verify: see Store; without it signatures are not required. sign: replies to signed batches. take_over: end
+        another server, instead of LinkError. standing_by: called while another server writes a shared journal, with
+        whether this one is up to date; exceptions end the wait.
         """
         self._sign = sign
         with ExitStack() as opened:
@@ -105,7 +103,7 @@ class Server:
         ]
 
     def lives(self) -> bool:
-        """Whether the writer takes batches: not where it has ended or hangs."""
+        """Whether the writer takes batches, neither ended nor hanging."""
         try:
             return bool(self._writer.alive())
         except QueryError:
@@ -122,16 +120,16 @@ class Server:
 
     @property
     def ended(self) -> str:
-        """Why another server is the site's writer now, empty while none is; the process should end."""
+        """Why another server is the writer, or ""; the process should end."""
         return self._claim.ended
 
     @property
     def fenced(self) -> str:
-        """Why this server may not write any more, since another one took over; the process should end."""
+        """Why another server took over, or ""; the process should end."""
         return self._writer.fenced or self._claim.superseded
 
     def close(self) -> None:
-        """Stop listening, finish what has come in, commit, snapshot."""
+        """Stop listening, finish received batches, commit, snapshot."""
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
         self._queries.stop()
@@ -141,13 +139,13 @@ class Server:
         self._upkeep.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]
         self._writer.close()
-        self._claim.close()  # the last: another server may use the store now
+        self._claim.close()  # last, because another server may then use the store
 
     def _on_batch(self, query: zenoh.Query) -> None:
         payload = query.payload.to_bytes() if query.payload else b""
         try:
             machine = keys.machine_of(str(query.key_expr))
-        except ConfigError:  # a wildcard in the key names no machine
+        except ConfigError:  # a wildcard names no machine
             machine = ""
 
         signature = query.attachment.to_bytes() if query.attachment else b""
@@ -158,7 +156,7 @@ class Server:
                 signed = self._sign(str(query.key_expr), payload, data) if self._sign and signature else None
                 try:
                     query.reply(query.key_expr, data, attachment=signed)
-                except zenoh.ZError as error:  # the asker is gone; it will ask again
+                except zenoh.ZError as error:  # the asker is gone and will ask again
                     log.info("reply failed machine=%s error=%r", machine, str(error))
 
         if not self._claim.held:
@@ -179,7 +177,7 @@ class Server:
 
 
 def warm_up(config: ServerConfig) -> None:
-    """Have all kernels, before the first batch and the first question."""
+    """Load all kernels before the first batch and question."""
     grid.warm_up(config.fold)
     batches.warm_up()
     block_credit.warm_up(config.fold)

@@ -82,7 +82,7 @@ class JournalQueries(Protocol):
 
     @property
     def replica(self) -> str:
-        """ "synchronous" if commits wait for another machine's disk too, "asynchronous" if one follows, else "none"."""
+        """Replication: "synchronous" if commits wait for another machine's disk, "asynchronous" or "none"."""
 
     def identity(self) -> StoreIdentity:
         """The store's identity; StoreError if damaged."""

@@ -1,1 +1,1 @@
-"""From evidence to what a reader asks for: one function per layer, NaN where unknown."""
+"""From evidence to layers: one function each, NaN where unknown."""

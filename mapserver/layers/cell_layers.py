@@ -1,8 +1,7 @@
 """Read layers: from evidence to float32 values, NaN where unknown (docs/layers.md).
 
-A new layer of a cell is a function and a line in LAYERS; one that looks at its neighbours, a function and a line in
-`gap_filling.AREA_LAYERS`. What is debatable, such as the classes' boundaries, is applied here,
-without folding again.
+A new layer is a function and a line in LAYERS, or in `gap_filling.AREA_LAYERS` if it reads neighbours. Debatable
+choices, such as class boundaries, apply on reading, without refolding.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from protocol.config import require_positive
 from protocol.errors import QueryError, Refusal
 from protocol.site import ground_classes
 
-LOG_STEP = math.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0])  # between resistance bins
+LOG_STEP = math.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0])  # between resistance bins, in log(c_rr)
 GRADE_STEP = float(ev.GRADE_CENTRES[1] - ev.GRADE_CENTRES[0])
-MAX_REACH_M = 50.0  # every window is widened by it, and its kernel has its square of cells
-SURE_AXIS = 0.2  # least length of the mean axis, 0 to 1, that is a preferred one
-# The centre of the votes for c_rr is off by so much of what they differ by, however many there are.
+MAX_REACH_M = 50.0  # limit of filling; windows are widened by it
+SURE_AXIS = 0.2  # least mean axis, 0 to 1, that is a preference
+# error of the votes' centre, relative to their spread, however many there are
 SPREAD_SHARE = 0.5
-# Votes for the class that leads less are mostly errors of places: shares to this power are right as often as they say.
+# minority votes are mostly position errors: with this power, shares are probabilities
 SHARPNESS = 1.5
 
 
@@ -39,9 +38,8 @@ SHARPNESS = 1.5
 class ReadConfig:
     """How evidence is read.
 
-    min_weight_m: cells with fewer metres of evidence than this are unknown; so are resistance and gradient where fewer
-    metres than this have one. boundaries: of the classes of resistance, increasing; n of them make n + 1 classes.
-    fill_reach_m: so far from the next known cell gaps are filled.
+    min_weight_m: least evidence of a cell, of resistance and of gradient. boundaries: of resistance classes,
+    increasing; n make n + 1 classes. fill_reach_m: largest distance of filling.
     """
 
     min_weight_m: float = 0.1
@@ -60,34 +58,28 @@ class ReadConfig:
 
 @dataclass(frozen=True)
 class CellEvidence:
-    """What the layers of cells are derived from.
-
-    evidence: of cells, arrays (cells, ...) as in Evidence. now_ns (cells,): the site's now, 0 where it is not known.
-    """
+    """Input of cell layers. evidence: arrays (cells, ...). now_ns (cells,): the site's now, 0 if unknown."""
 
     evidence: ev.Evidence
     now_ns: Ints
     config: ReadConfig
 
     def votes(self, part: slice) -> Floats:
-        """Votes (cells, bins) of one histogram; exact as floating point, and several times faster.
-
-        None where they are too few: most samples of a cell may say only that the machine was there.
-        """
+        """Votes (cells, bins) of a histogram as floats, exact and faster; 0 if too few."""
         votes: Floats = self.evidence.counts[..., part].astype(np.float64)
         votes[votes.sum(axis=-1) < self.config.min_weight_m * ev.WEIGHT_UNITS_PER_M] = 0.0
         return votes
 
-    # Centres on the bin axis; several layers ask for them.
+    # Centres in bins, used by several layers.
     @cached_property
     def resistance_bin(self) -> Floats:
-        """Robust centre of the c_rr votes, in bins."""
+        """Robust centre of c_rr votes, in bins."""
         return robust_centre(self.votes(ev.RESISTANCE), reach=2.5)
 
     @cached_property
     def gradient(self) -> tuple[Floats, Floats]:
-        """Robust centre of the votes for the gradient, east and north [m/m]."""
-        # nearer than for c_rr: gradients one and a half bins apart meet in a cell, and must not be averaged
+        """Robust centre of gradient votes, east and north [m/m]."""
+        # shorter reach than for c_rr, so that gradients 1.5 bins apart are not averaged
         east, north = (robust_centre(self.votes(part), reach=1.5) for part in (ev.GRADE_EAST, ev.GRADE_NORTH))
         return ev.GRADE_CENTRES[0] + GRADE_STEP * east, ev.GRADE_CENTRES[0] + GRADE_STEP * north
 
@@ -98,13 +90,13 @@ Layer = Callable[[CellEvidence], Floats]
 
 
 def resistance(cells: CellEvidence) -> Floats:
-    """Rolling resistance coefficient [-]: robust centre of the votes, in log(c_rr)."""
+    """Rolling resistance coefficient [-]: robust centre of votes in log(c_rr)."""
     centre: Floats = ev.RESISTANCE_CENTRES[0] * np.exp(LOG_STEP * cells.resistance_bin)
     return centre
 
 
 def resistance_std(cells: CellEvidence) -> Floats:
-    """Standard deviation of `resistance` [-]: half of what votes differ by, and what they err in alike."""
+    """Standard deviation of `resistance` [-]: half the votes' spread, and the common error."""
     c_rr = resistance(cells)
     spread = SPREAD_SHARE * c_rr * LOG_STEP * robust_spread(cells.votes(ev.RESISTANCE))
     deviation: Floats = np.sqrt(spread**2 + error_model.resistance_variance(c_rr))
@@ -112,25 +104,25 @@ def resistance_std(cells: CellEvidence) -> Floats:
 
 
 def resistance_class(cells: CellEvidence) -> Floats:
-    """Index of the ground class with most votes (by default 0 dry concrete ... 4 sand)."""
+    """Index of the ground class with most votes (default 0 dry concrete ... 4 sand)."""
     votes = _class_votes(cells)
     return np.where(votes.sum(axis=-1) > 0, votes.argmax(axis=-1), np.nan)
 
 
 def confidence(cells: CellEvidence) -> Floats:
-    """How likely the leading ground class is right: its share of all classes' votes, each to the power SHARPNESS."""
+    """Chance that the leading class is right: its share of votes to the power SHARPNESS."""
     votes = _class_votes(cells)
     sharp = (votes / np.maximum(votes.sum(axis=-1, keepdims=True), 1.0)) ** SHARPNESS
     return ratio(sharp.max(axis=-1), sharp.sum(axis=-1))
 
 
 def grade_east(cells: CellEvidence) -> Floats:
-    """Eastern component of the gradient [m/m], positive where the ground rises to the east."""
+    """Eastern gradient [m/m], positive if the ground rises to the east."""
     return cells.gradient[0]
 
 
 def grade_north(cells: CellEvidence) -> Floats:
-    """Northern component of the gradient [m/m], positive where the ground rises to the north."""
+    """Northern gradient [m/m], positive if the ground rises to the north."""
     return cells.gradient[1]
 
 
@@ -140,7 +132,7 @@ def grade(cells: CellEvidence) -> Floats:
 
 
 def grade_std(cells: CellEvidence) -> Floats:
-    """Standard deviation of one component of the gradient [m/m], root mean square of the two, as `resistance_std`."""
+    """Standard deviation of a gradient component [m/m], RMS of both."""
     east, north = (robust_spread(cells.votes(part)) for part in (ev.GRADE_EAST, ev.GRADE_NORTH))
     spread = GRADE_STEP * np.hypot(east, north) / math.sqrt(2)
     deviation: Floats = np.sqrt(spread**2 + error_model.gradient_variance(grade(cells)))
@@ -148,14 +140,14 @@ def grade_std(cells: CellEvidence) -> Floats:
 
 
 def slope_class(cells: CellEvidence) -> Floats:
-    """0 flat, 1 slope (the paper's: steeper than 7.5 degrees)."""
+    """0 flat, 1 slope (in the paper: over 7.5 degrees)."""
     classes = ground_classes.slope_class(*cells.gradient)
     return np.where(classes == ground_classes.UNKNOWN, np.nan, classes.astype(np.float64))
 
 
 def heading(cells: CellEvidence) -> Floats:
-    """Axis along which machines drive [rad], -pi/2 to pi/2 from east, both ways alike; NaN where none is preferred."""
-    # the axis, not the direction: a haul road is driven both ways, and doubled angles do not cancel then
+    """Axis of driving [rad], -pi/2 to pi/2 from east, or NaN."""
+    # doubled angles, as opposite directions of a haul road must not cancel
     votes = cells.votes(ev.HEADING)
     doubled = np.exp(4j * np.pi / ev.SECTORS * np.arange(ev.SECTORS))
     east, north = votes @ doubled.real, votes @ doubled.imag
@@ -164,12 +156,12 @@ def heading(cells: CellEvidence) -> Floats:
 
 
 def visits(cells: CellEvidence) -> Floats:
-    """How many visits a cell had; at most 266."""
+    """Number of visits, at most 266."""
     return linear_count(cells.evidence.bitmaps[..., ev.VISITS])
 
 
 def machines(cells: CellEvidence) -> Floats:
-    """How many machines drove here; at most 266."""
+    """Number of machines, at most 266."""
     return linear_count(cells.evidence.bitmaps[..., ev.MACHINES])
 
 
@@ -180,12 +172,12 @@ def weight(cells: CellEvidence) -> Floats:
 
 
 def age_s(cells: CellEvidence) -> Floats:
-    """Time from the newest sample to the site's now [s]; NaN where now is not known."""
+    """Age of the newest sample at the site's now [s], NaN if now is unknown."""
     return seconds_ago(cells.evidence.newest_ns, cells.now_ns)
 
 
 def changed_s(cells: CellEvidence) -> Floats:
-    """Time from the ground's last change to the site's now [s]; NaN where there was none or now is not known."""
+    """Age of the last change at the site's now [s], NaN for none or if now is unknown."""
     return seconds_ago(cells.evidence.changed_ns, cells.now_ns)
 
 
@@ -212,7 +204,7 @@ LAYERS: dict[str, Layer] = {
 
 
 def select(names: Sequence[str]) -> tuple[str, ...]:
-    """Check layer names; none means all layers of cells (filled ones are asked for by name)."""
+    """Check layer names; none means all cell layers."""
     known = [*LAYERS, *AREA_LAYERS]
     if unknown := [name for name in names if name not in known]:
         problem = f"layer `{unknown[0][:40]}` is not known; known: {', '.join(known)}"
@@ -223,10 +215,7 @@ def select(names: Sequence[str]) -> tuple[str, ...]:
 def read(
     evidence: ev.Evidence, names: Sequence[str], config: ReadConfig, now_ns: int | Ints = 0
 ) -> dict[str, Floats32]:
-    """Derive layers of cells, each (blocks, 256), NaN where the evidence is too thin.
-
-    now_ns: the site's now, one or (blocks, 1).
-    """
+    """Cell layers (blocks, 256), NaN for thin evidence. now_ns: the site's now, one or (blocks, 1)."""
     metres = evidence.weight
     known = (metres > 0) & (metres >= config.min_weight_m * ev.WEIGHT_UNITS_PER_M)
     known_cells = {field.name: getattr(evidence, field.name)[known] for field in dataclasses.fields(evidence)}
@@ -238,7 +227,7 @@ def read(
 
 
 def required(names: Sequence[str]) -> tuple[str, ...]:
-    """Layers of cells from which `derive_area` makes these layers, each once."""
+    """Distinct cell layers that `derive_area` needs."""
     cells: dict[str, None] = {}
     for name in names:
         needs = required(AREA_LAYERS[name].needs) if name in AREA_LAYERS else (name,)
@@ -247,23 +236,20 @@ def required(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def margin_cells(names: Sequence[str], cell_m: float, config: ReadConfig) -> int:
-    """By how many cells on each side a window must be widened before `derive_area`, and cropped after it."""
+    """Cells by which `derive_area` needs a wider window on each side."""
     return math.ceil(config.fill_reach_m / cell_m) if any(name in AREA_LAYERS for name in names) else 0
 
 
 def derive_area(
     names: Sequence[str], cells: Mapping[str, Floats32], cell_m: float, config: ReadConfig
 ) -> dict[str, Floats32]:
-    """Make these layers, of cells or areas, from the `required` layers of cells, all (rows, columns)."""
+    """Derive these layers from the `required` cell layers, all (rows, columns)."""
     done: dict[str, Floats] = {name: values.astype(np.float64) for name, values in cells.items()}
     return {name: _derived(name, done, cell_m, config).astype(np.float32) for name in names}
 
 
 def _derived(name: str, done: dict[str, Floats], cell_m: float, config: ReadConfig) -> Floats:
-    """One layer, with those that it needs added to `done`.
-
-    No closure: one that calls itself is a cycle, and keeps the arrays of a query until the next collection.
-    """
+    """One layer; adds its inputs to `done`. A recursive closure would be a cycle, and keep arrays until collected."""
     if name not in done:
         for need in AREA_LAYERS[name].needs:
             _derived(need, done, cell_m, config)
@@ -275,7 +261,7 @@ def _derived(name: str, done: dict[str, Floats], cell_m: float, config: ReadConf
 
 
 def _class_votes(cells: CellEvidence) -> Floats:
-    """Votes (cells, classes): each bin's, by the share of its width, in log(c_rr), that lies in each class."""
+    """Votes (cells, classes): bins divided by width in log(c_rr)."""
     position = np.log(np.array(cells.config.boundaries) / ev.RESISTANCE_CENTRES[0]) / LOG_STEP
     edges = np.concatenate([[-np.inf], position, [np.inf]])
     bins = np.arange(ev.RESISTANCE_BINS)[:, None]
@@ -285,5 +271,5 @@ def _class_votes(cells: CellEvidence) -> Floats:
 
 
 def seconds_ago(stamp_ns: AnyArray, now_ns: Ints) -> Floats:
-    """Time since stamps [s], not below 0; NaN where either is 0, which means not known."""
+    """Time since stamps [s], at least 0; NaN if either is 0, unknown."""
     return np.where((stamp_ns > 0) & (now_ns > 0), np.maximum(now_ns - stamp_ns, 0) / 1e9, np.nan)

@@ -1,10 +1,9 @@
-"""Filling of gaps by kernel inference: an estimate for cells that nobody drove, and its uncertainty.
+"""Gap filling by kernel inference: estimates of undriven cells, with uncertainty.
 
-Known cells vote for the unknown ones around them, each with a weight that falls to zero at the kernel's reach: Bayesian
-generalised kernel inference (Shan, Wang, Englot, Doherty, "Bayesian Generalized Kernel Inference for Terrain
-Traversability Mapping", CoRL 2018) with the sparse kernel of Melkumyan and Ramos ("A Sparse Covariance Function for
-Exact Gaussian Process Inference in Large Datasets", IJCAI 2009). Known cells keep what they have. Windows are
-(rows, columns), NaN where unknown; pure functions.
+Known cells vote for those around, with weights that fall to zero at the kernel's reach: Bayesian generalised kernel
+inference (Shan, Wang, Englot, Doherty, "Bayesian Generalized Kernel Inference for Terrain Traversability Mapping", CoRL
+2018), sparse kernel of Melkumyan and Ramos ("A Sparse Covariance Function for Exact Gaussian Process Inference in Large
+Datasets", IJCAI 2009). Known cells keep their values. Windows are (rows, columns), NaN where unknown.
 """
 
 from __future__ import annotations
@@ -19,17 +18,16 @@ import numpy as np
 from mapserver.error_model import GRADE_PRIOR_STD, RESISTANCE_PRIOR_STD
 from protocol.arrays import Bools, Floats
 
-PRIOR_M2 = 0.1  # the prior weighs as much as this area of sure ground right at the cell
-HALF_SURE_M = 1.0  # a cell with so many metres of evidence counts half: more do not describe the ground beside it
-# Less evidence than this [m2] is none: beyond 0.94 of the reach a single cell has no effect, and the filters' rounding
-# stays far below what counts.
+PRIOR_M2 = 0.1  # weight of the prior, as certain ground at the cell
+HALF_SURE_M = 1.0  # metres that count half: more say no more about ground beside
+# Least evidence [m2]: beyond 0.94 of the reach a cell has no effect, and filters' rounding is far below.
 LEAST_M2 = 1e-5
 
 
 def sparse_kernel(reach_m: float, cell_m: float) -> Floats:
-    """Kernel (k, k), k odd, in m2: its value times the area of a cell, so that the size of cells does not matter.
+    """Kernel (k, k), k odd, times cell area [m2], to be independent of cell size.
 
-    With u = distance / reach: (2 + cos 2 pi u) (1 - u) / 3 + sin(2 pi u) / (2 pi) for u < 1, else 0; 1 at the centre.
+    With u = distance / reach: (2 + cos 2 pi u) (1 - u) / 3 + sin(2 pi u) / (2 pi) for u < 1, else 0.
     """
     half = math.ceil(reach_m / cell_m)
     axis = np.arange(-half, half + 1) * cell_m
@@ -40,26 +38,25 @@ def sparse_kernel(reach_m: float, cell_m: float) -> Floats:
 
 
 def cell_weights(values: Floats, weight_m: Floats, std: Floats, prior_std: float) -> Floats:
-    """How much each known cell counts, 0 to 1: half with HALF_SURE_M of evidence, half with votes as wide as the prior.
+    """Weights of cells, 0 to 1: half at HALF_SURE_M of evidence, and at the prior's spread; 0 for NaN.
 
-    Saturates, because a hundred passes over one cell say no more about its neighbours than ten. 0 where values are NaN.
+    Saturated, because a hundred passes say no more about neighbours than ten.
     """
     weights: Floats = weight_m / (weight_m + HALF_SURE_M) / (1 + (std / prior_std) ** 2)
     return np.where(np.isfinite(values), weights, 0.0)
 
 
 def fill_by_mean(values: Floats, weights: Floats, kernel: Floats) -> Floats:
-    """Fill with the weighted mean of the neighbours."""
+    """Fill with the mean of neighbours."""
     area = _smooth(weights, kernel)
     total = _smooth(weights * np.nan_to_num(values), kernel)
     return _keep_known(values, area, total / np.maximum(area, LEAST_M2))
 
 
 def fill_by_majority(values: Floats, weights: Floats, kernel: Floats, boundaries: Sequence[float]) -> Floats:
-    """Fill with the weighted mean of those neighbours that are of the leading class.
+    """Fill with the weighted mean of neighbours in the leading class.
 
-    Between concrete (0.008) and sand (0.25) a mean would invent dirt that is nowhere near: classes vote first.
-    boundaries: increasing, in the unit of the values.
+    Between concrete (0.008) and sand (0.25) a plain mean would invent dirt. boundaries: increasing, as values.
     """
     classes = np.digitize(values, boundaries)
     leading, best = np.zeros(values.shape), np.full(values.shape, np.nan)
@@ -68,7 +65,7 @@ def fill_by_majority(values: Floats, weights: Floats, kernel: Floats, boundaries
         own = np.where(classes == index, weights, 0.0)
         if not own.any():
             continue
-        # rounded: equal votes must not be decided by the filters' rounding, which differs with the window
+        # rounded: filters' rounding, which depends on the window, must not decide ties
         votes = _smooth(own, kernel).round(9)
         mean = _smooth(own * np.nan_to_num(values), kernel) / np.maximum(votes, LEAST_M2)
         best = np.where(votes > leading, mean, best)
@@ -79,11 +76,10 @@ def fill_by_majority(values: Floats, weights: Floats, kernel: Floats, boundaries
 def filled_std(
     values: Floats, std: Floats, weights: Floats, filled: Floats, prior_std: float, kernel: Floats
 ) -> Floats:
-    """Posterior standard deviation of filled cells; known cells keep their own.
+    """Posterior standard deviation of filled cells; known cells keep theirs.
 
-    The weighted second moment of the neighbours about the filled value, their own variances included, with the prior
-    as one more neighbour of area PRIOR_M2. So it grows with the distance to evidence up to the prior's, and where
-    neighbours disagree.
+    Weighted second moment of neighbours about the filled value, with their variances, and the prior as an area
+    PRIOR_M2: it grows with distance, up to the prior's, and with disagreement.
     """
     x = np.nan_to_num(values)
     area = _smooth(weights, kernel)
@@ -101,7 +97,7 @@ def _keep_known(values: Floats, area: Floats, estimate: Floats) -> Floats:
 
 
 def _smooth(image: Floats, kernel: Floats) -> Floats:
-    """Sum over the kernel; nothing is known outside the window."""
+    """Empty outside the window."""
     out: Floats = np.asarray(cv2.filter2D(image, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT), np.float64)
     return out
 
@@ -111,10 +107,7 @@ def _smooth(image: Floats, kernel: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Area:
-    """What an area layer is derived from.
-
-    layers: those that it needs, (rows, columns). reach_m, boundaries: fill_reach_m and boundaries of the read options.
-    """
+    """Input of an area layer. layers: (rows, columns). reach_m, boundaries: read options."""
 
     layers: Mapping[str, Floats]
     cell_m: float
@@ -126,33 +119,33 @@ class Area:
 
     @property
     def kernel(self) -> Floats:
-        """The filling kernel at this size of cells."""
+        """The filling kernel for these cells."""
         return sparse_kernel(self.reach_m, self.cell_m)
 
 
 @dataclass(frozen=True)
 class AreaLayer:
-    """A layer that needs others, of cells or areas, around each cell."""
+    """A layer derived from others around each cell."""
 
     needs: tuple[str, ...]
     derive: Callable[[Area], Floats]
 
 
 def resistance_filled(area: Area) -> Floats:
-    """`resistance`, gaps filled with the mean, in log(c_rr), of the class that leads around them."""
+    """`resistance`; gaps get the log mean of the leading class around."""
     log, _, weights = _log_resistance(area)
     return np.exp(fill_by_majority(log, weights, area.kernel, np.log(area.boundaries).tolist()))
 
 
 def resistance_filled_std(area: Area) -> Floats:
-    """Standard deviation of `resistance_filled` [-]; `resistance_std` in known cells."""
+    """Standard deviation [-]; `resistance_std` in known cells."""
     log, std, weights = _log_resistance(area)
     filled = area["resistance_filled"]
     return filled * filled_std(log, std, weights, np.log(filled), RESISTANCE_PRIOR_STD, area.kernel)
 
 
 def resistance_class_filled(area: Area) -> Floats:
-    """`resistance_class`, gaps filled with the class of `resistance_filled`."""
+    """`resistance_class`; gaps by `resistance_filled`."""
     filled = area["resistance_filled"]
     classes = np.where(np.isfinite(filled), np.digitize(filled, area.boundaries), np.nan)
     known = np.isfinite(area["resistance"])
@@ -175,7 +168,7 @@ def grade_filled(area: Area) -> Floats:
 
 
 def grade_filled_std(area: Area) -> Floats:
-    """Standard deviation of one component of the filled gradient [m/m]; `grade_std` in known cells."""
+    """Standard deviation of a gradient component [m/m]; `grade_std` in known cells."""
     std, weights, kernel = area["grade_std"], _grade_weights(area), area.kernel
     east, north = (
         filled_std(area[name], std, weights, area[f"{name}_filled"], GRADE_PRIOR_STD, kernel)
@@ -185,13 +178,13 @@ def grade_filled_std(area: Area) -> Floats:
 
 
 def _log_resistance(area: Area) -> tuple[Floats, Floats, Floats]:
-    """Log(c_rr), its standard deviation and the cells' weights."""
+    """Log(c_rr), its standard deviation, and weights."""
     log, std = np.log(area["resistance"]), area["resistance_std"] / area["resistance"]
     return log, std, cell_weights(log, area["weight"], std, RESISTANCE_PRIOR_STD)
 
 
 def _grade_weights(area: Area) -> Floats:
-    # a sample has both components or none, so one of them tells which cells are known
+    # samples have both components or none
     return cell_weights(area["grade_east"], area["weight"], area["grade_std"], GRADE_PRIOR_STD)
 
 

@@ -1,11 +1,11 @@
-"""Lanes: metres driven by heading, of which those fade that lie long back, or before many others of that direction.
+"""Lanes: metres driven by heading, fading with age and later traffic in the same direction.
 
-A road that is moved, a face that is dug away: nobody says so, but machines drive elsewhere from then on. So in a square
-of 16 x 16 cells a pass counts by what was driven there later, in the same direction or nearly so, and by its age:
+When a road moves, machines silently drive elsewhere. So in a block passes fade with later metres in about the same
+direction, and with age:
 
     metres = sum of passes (1 - aid_share) exp(-later metres / FADES_M) 2^(-age / FADES_DAYS)
 
-A pass whose place came from lanes in part counts by what is left, so that lanes do not confirm themselves.
+1 - aid_share removes what positions took from lanes, which must not confirm themselves.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from protocol.arrays import Floats, Ints
 from protocol.queries.lanes import SCALE_M, LaneTile
 from protocol.site.geometry import BLOCK_CELLS
 
-FADES_M = 8 * BLOCK_CELLS * 1.0  # eight passes: fewer know the lane's middle less well, more hold on to a moved road
-FADES_DAYS = 7.0  # in which a lane that nobody drives counts half
-LEAST_M = 0.1  # less of a cell is left out
+FADES_M = 8 * BLOCK_CELLS * 1.0  # eight passes: fewer know the middle less well, more keep a moved road
+FADES_DAYS = 7.0  # half-life of an unused lane [days]
+LEAST_M = 0.1  # metres; smaller values are left out
 
 
 def lane_tile(block: Block, pages: TimedPages, first: Ints, stamp_ns: int) -> LaneTile | None:
-    """Lanes of one block; first: index (256,) of the page from which on each cell counts. None where nobody drove."""
+    """Lanes of one block, None if undriven. first: index (256,) of each cell's first valid page."""
     metres, later_m = np.zeros((ev.SECTORS, ev.CELLS)), np.zeros(ev.SECTORS)
     visits, machines = np.zeros(ev.CELLS, np.uint64), np.uint64(0)
     newest_ns, days = 0, set()
@@ -51,7 +51,7 @@ def lane_tile(block: Block, pages: TimedPages, first: Ints, stamp_ns: int) -> La
 
 
 def _by_sector(timed: TimedPage, first: Ints, index: int) -> Floats:
-    """Metres (16, 256) of a page in each sector of heading, of the cells in which it counts, less what was aided."""
+    """Metres (16, 256) of a page by heading, in cells where it is valid, without aided shares."""
     counts = np.zeros((ev.COUNTS, ev.CELLS))
     counts.reshape(-1)[timed.page.votes["place"]] = timed.page.votes["count"]
     metres = counts[ev.HEADING] * ((first <= index) / ev.WEIGHT_UNITS_PER_M)

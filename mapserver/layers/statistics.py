@@ -1,6 +1,6 @@
-"""Robust statistics of votes: the centre and the spread of a histogram, and how many there were.
+"""Robust statistics of votes: centre, spread and count of histograms.
 
-Votes are (cells, bins) counts; results are (cells,), on the bin axis, NaN without votes.
+Votes (cells, bins); results (cells,) on the bin axis, NaN without votes.
 """
 
 from __future__ import annotations
@@ -13,14 +13,13 @@ from protocol.arrays import AnyArray, Floats
 def robust_centre(votes: Floats, reach: float) -> Floats:
     """Centre of votes (cells, bins) on the bin axis.
 
-    Starts from the median bin and the larger of its neighbours, which ignores a second kind of ground in the cell where
-    it is one and a half bins away, then takes the mean of what is near, twice: votes within one bin of the centre
-    count, those beyond `reach` bins do not. Exact where all votes agree, because a vote is split linearly between two
-    bins, and unbiased where noise is symmetric.
+    From the median bin and its larger neighbour, which ignores other ground 1.5 bins away, a local mean, twice: votes
+    within one bin count fully, beyond `reach` bins not. Exact for equal votes, which are split linearly between bins;
+    unbiased for symmetric noise.
     """
     summed = votes.cumsum(axis=-1)
     median = (2 * summed >= summed[..., -1:]).argmax(axis=-1)
-    offsets = np.arange(-3, 4)  # all that the mean can reach
+    offsets = np.arange(-3, 4)  # the reach of the mean
     bins = median[..., None] + offsets
     inside = (bins >= 0) & (bins < votes.shape[-1])
     near = np.where(inside, np.take_along_axis(votes, np.where(inside, bins, 0), axis=-1), 0.0)
@@ -35,12 +34,11 @@ def robust_centre(votes: Floats, reach: float) -> Floats:
 
 
 def robust_spread(votes: Floats) -> Floats:
-    """Standard deviation of votes (cells, bins) about their mean, in bins.
+    """Standard deviation of votes (cells, bins), in bins, without outliers by quartiles.
 
-    Votes further from the median than the quartiles allow do not count. A vote at fraction f between two bins is split
-    between them, which adds f (1 - f) to the variance of votes that agree, and 1/6, the mean of it, to that of votes
-    that spread over bins; in between the difference decays as exp(-2 pi^2 variance), the first term of its Fourier
-    series. That is taken off, so votes that agree give 0; a spread below a third of a bin looks like none.
+    Splitting votes at fraction f between bins adds f (1 - f) to the variance of equal votes, on average 1/6 to that of
+    wide ones; in between the difference decays as exp(-2 pi^2 variance), the first term of its Fourier series.
+    Subtracted, so equal votes give 0, as does a spread below a third of a bin.
     """
     summed = votes.cumsum(axis=-1)
     first, median, third = ((4 * summed >= k * summed[..., -1:]).argmax(axis=-1) for k in (1, 2, 3))
@@ -53,19 +51,19 @@ def robust_spread(votes: Floats) -> Floats:
     fraction = mean - np.floor(mean)
     split = fraction * (1 - fraction) - 1 / 6
     spread = np.zeros(mean.shape)
-    for _ in range(8):  # a fixed point: what binning adds depends on the spread
+    for _ in range(8):  # fixed point, because the binning error depends on the spread
         spread = np.maximum(variance - 1 / 6 - split * np.exp(-2 * np.pi**2 * spread), 0)
     return np.sqrt(spread)
 
 
 def linear_count(bitmaps: AnyArray) -> Floats:
-    """How many different things were hashed into 64-bit bitmaps, at most 266: linear counting (Whang et al. 1990)."""
+    """Number of values hashed into 64-bit bitmaps, at most 266: linear counting (Whang et al. 1990)."""
     bits = np.bitwise_count(bitmaps).astype(np.float64)
     return np.where(bits > 0, np.rint(-64 * np.log(1 - np.minimum(bits, 63) / 64)), np.nan)
 
 
 def ratio(numerator: Floats, denominator: Floats) -> Floats:
-    """Quotient, NaN where the denominator is not positive."""
+    """Quotient, NaN unless the denominator is positive."""
     out: Floats = np.full(denominator.shape, np.nan)
     np.divide(numerator, denominator, out=out, where=denominator > 0)
     return out

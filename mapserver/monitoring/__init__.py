@@ -1,1 +1,1 @@
-"""The server in numbers, for Prometheus: what it collects, HTTP."""
+"""The server's metrics for Prometheus: collector and HTTP."""

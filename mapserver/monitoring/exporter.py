@@ -1,4 +1,4 @@
-"""HTTP for Prometheus, on threads of its own."""
+"""HTTP for Prometheus, on its own threads."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from prometheus_client.registry import Collector
 from protocol.errors import LinkError
 
 PATH = "/metrics"
-REQUEST_S = 5.0  # a visitor that says nothing for so long is cut off
+REQUEST_S = 5.0  # timeout of a silent visitor
 log = logging.getLogger("mapserver.monitoring.exporter")
 
 
 class Exporter:
-    """Answers GET /metrics with the metrics of a collector and of this process, until closed."""
+    """Answers GET /metrics with metrics of a collector and of this process."""
 
     def __init__(self, listen: tuple[str, int], collector: Collector) -> None:
-        """Listen on a host and port. LinkError where the address cannot be had."""
+        """LinkError if the address is not available."""
         registry = CollectorRegistry()
         registry.register(collector)
         ProcessCollector(registry=registry)
@@ -38,7 +38,7 @@ class Exporter:
 
     @property
     def url(self) -> str:
-        """Where Prometheus finds it."""
+        """Address for Prometheus."""
         host, port = self._server.server_address[:2]
         return f"http://{host!s}:{port}{PATH}"
 
@@ -50,7 +50,7 @@ class Exporter:
 
 
 def _application(registry: CollectorRegistry) -> WSGIApplication:
-    """The library's application, at one path, and with failures in our own log."""
+    """The library's application at one path, failures in our log."""
     answer = make_wsgi_app(registry)
 
     def application(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
@@ -58,7 +58,7 @@ def _application(registry: CollectorRegistry) -> WSGIApplication:
         if environ["PATH_INFO"] == PATH:
             try:
                 return answer(environ, start_response)  # type: ignore[no-any-return]
-            except Exception:  # whatever it is, the map goes on
+            except Exception:  # the map must go on
                 log.exception("metrics failed")
                 status = "503 Service Unavailable"
         start_response(status, [("Content-Length", "0")])
@@ -68,10 +68,10 @@ def _application(registry: CollectorRegistry) -> WSGIApplication:
 
 
 class _Server(ThreadingMixIn, WSGIServer):
-    daemon_threads = True  # nor waited for: a visitor that reads slowly must not hold up the end
+    daemon_threads = True  # a slow visitor must not delay the end
 
     def server_bind(self) -> None:
-        """Bind without asking for the host's full name, as HTTPServer does: that may take long."""
+        """Without the slow lookup of the host's full name of HTTPServer."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
         self.setup_environ()
@@ -81,4 +81,4 @@ class _Handler(WSGIRequestHandler):
     timeout = REQUEST_S
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the library's names
-        """Standard error is for the log's lines."""
+        """Standard error is for the log."""

@@ -1,6 +1,6 @@
-"""Metrics of the server: a collector that asks the server each time that Prometheus does, and the health of its agents.
+"""Metrics of the server, collected on each request of Prometheus, and its agents' health.
 
-Names follow https://prometheus.io/docs/practices/naming/: base units, `_total` for what only grows until a restart.
+Names follow https://prometheus.io/docs/practices/naming/: base units, `_total` for counters.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from protocol.wire.latest_values import LatestValues
 
 _REFUSED, _REFUSED_QUERY = "refused_", "refused_query_"
 Family = GaugeMetricFamily | CounterMetricFamily
-Values = float | Mapping[str, float]  # of one metric, or by the value of its label
+Values = float | Mapping[str, float]  # one value, or values by label
 
 
 @dataclass(frozen=True)
 class ReceivedHealth:
-    """The newest health of one agent: its values, and the server's clock when it came in [s since 1970]."""
+    """An agent's newest health, and server time of reception [s since 1970]."""
 
     values: Mapping[str, Any]
     received_s: float
 
 
 class HealthListener:
-    """Keeps the newest health of every agent of a site as bytes until somebody asks: callbacks only move bytes."""
+    """Keeps each agent's newest health as bytes until needed: callbacks only move bytes."""
 
     def __init__(self, session: zenoh.Session, site: str, clock: Callable[[], float] = time.time) -> None:
         self._newest: LatestValues[bytes] = LatestValues(clock)
         self._subscriber = session.declare_subscriber(keys.health_all(site), self._on_health)
 
     def received(self) -> dict[str, ReceivedHealth]:
-        """By machine, without health that cannot be read, or that came under the key of another machine."""
+        """Valid health by machine, if it came under the machine's own key."""
         readable = {}
         for name, data, received_s in sorted(self._newest.items()):
             try:
@@ -75,8 +75,7 @@ class HealthListener:
 class ServerCollector(Collector):
     """All metrics of a server, except those of its process.
 
-    info: answers as `map/info` does, and asks the thread that owns the store. agents: their health by machine.
-    changes: of the ground, all so far.
+    info: as `map/info`, from the store's thread. agents: health by machine. changes: of the ground, so far.
     """
 
     def __init__(
@@ -90,11 +89,11 @@ class ServerCollector(Collector):
         self._info, self._agents, self._changes, self._store, self._version = info, agents, changes, store, version
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing: a registry need not ask the server for the names when this is registered."""
+        """Empty, so that registering does not query the server."""
         return []
 
     def collect(self) -> Iterable[Metric]:
-        """All metrics as of now."""
+        """All metrics."""
         start_s = time.perf_counter()
         info = self._info()
         turn_s = time.perf_counter() - start_s
@@ -120,7 +119,7 @@ def size_of(folder: Path) -> int:
 def _size(path: Path) -> int:
     try:
         return path.stat().st_size if path.is_file() else 0
-    except OSError:  # gone meanwhile
+    except OSError:  # deleted meanwhile
         return 0
 
 
@@ -162,13 +161,13 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
 
 
 def _became(change: GroundChange) -> str:
-    """Whether a machine rolls with less or more resistance there than before."""
+    """By resistance."""
     before, after = change.resistance_before, change.resistance_after
     return "unclear" if before is None or after is None else "better" if after < before else "worse"
 
 
 def _ahead_s(info: Mapping[str, Any]) -> float:
-    """Negative where a site is idle, or replays a log; 0 before there is a sample."""
+    """Negative for an idle site or replayed log; 0 before any sample."""
     return (info["stamp_ns"] - info["wall_ns"]) / 1e9 if info["stamp_ns"] else 0.0
 
 
@@ -208,7 +207,7 @@ def _agent_health(agents: Mapping[str, ReceivedHealth]) -> Iterable[Metric]:
 
 
 def _problems(agents: Mapping[str, ReceivedHealth]) -> Metric:
-    """1 where an agent says what is wrong, 0 where it says that nothing is."""
+    """1 where an agent reports a problem, 0 where it reports none."""
     metric = GaugeMetricFamily(
         "sitegrid_agent_problem", "Whether something is wrong with a part of it.", labels=["machine", "part"]
     )
@@ -241,7 +240,7 @@ _gauge, _counter = partial(_filled, GaugeMetricFamily), partial(_filled, Counter
 
 
 def _layers(counters: Mapping[str, int]) -> dict[str, int]:
-    """How many were kept from an earlier query, and how many were derived."""
+    """Layers from the cache, and derived ones."""
     return {source: counters.get(f"layers_{source}", 0) for source in ("kept", "derived")}
 
 
@@ -250,7 +249,7 @@ def _without(counters: Mapping[str, int], prefix: str) -> dict[str, int]:
 
 
 def _number(values: Mapping[str, Any], part: str, field: str) -> float | None:
-    """A number from what an agent sent, which may be anything."""
+    """A number from an agent's data, which may be anything."""
     table = values.get(part)
     value = table.get(field) if isinstance(table, Mapping) else None
     return float(value) if isinstance(value, int | float) else None

@@ -1,1 +1,1 @@
-"""Map queries answered: views of the grid or of the past, and the layers read from them."""
+"""Answers to map queries: views of the grid or the past, and layers read from them."""

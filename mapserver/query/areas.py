@@ -1,4 +1,4 @@
-"""Outlines and larger cells of regions, in pure functions."""
+"""Outlines and larger cells of regions, as pure functions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from protocol.site.geometry import CellWindow
 
 
 def cells_to_a_side(resolution_m: float | None, cell_m: float) -> int:
-    """How many cells of the map a larger one has to a side; QueryError where they do not divide it."""
+    """Map cells to a side of a larger one; QueryError if they do not divide it."""
     if resolution_m is None:
         return 1
     count = round(resolution_m / cell_m)
@@ -24,12 +24,12 @@ def cells_to_a_side(resolution_m: float | None, cell_m: float) -> int:
 
 
 def finer(window: CellWindow, count: int) -> CellWindow:
-    """The same window in cells of which `count` to a side make one."""
+    """The same window in cells `count` times smaller."""
     return CellWindow(window.column * count, window.row * count, window.columns * count, window.rows * count)
 
 
 def means(values: Floats32, count: int) -> Floats32:
-    """Mean of what is known in each square of count x count cells; NaN where nothing is."""
+    """Mean of known values in squares of count x count cells; NaN for none."""
     rows, columns = values.shape
     squares = values.reshape(rows // count, count, columns // count, count).astype(np.float64)
     known = np.isfinite(squares)
@@ -38,12 +38,12 @@ def means(values: Floats32, count: int) -> Floats32:
 
 
 def inside(outline: Sequence[Place], window: CellWindow, cell_m: float) -> Bools:
-    """Whose centre (rows, columns) lies in an outline: an odd number of its sides lies to the west of it.
+    """Cells (rows, columns) with centres in an outline: an odd number of its sides lies to the west.
 
-    Of two outlines with a side in common, each centre lies in one.
+    Of two outlines with a common side, exactly one has a centre near it.
     """
     crossings = np.zeros((window.rows, window.columns + 1), np.int64)
-    corners = np.array(outline) / cell_m - 0.5 - (window.column, window.row)  # in cells, from the first centre on
+    corners = np.array(outline) / cell_m - 0.5 - (window.column, window.row)  # in cells, from the first centre
     for (x, y), (to_x, to_y) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         low, high = min(y, to_y), max(y, to_y)
         rows = np.arange(max(0, np.ceil(low)), min(window.rows, np.ceil(high)), dtype=np.int64)

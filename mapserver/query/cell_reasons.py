@@ -1,4 +1,4 @@
-"""Why a cell has its value: its votes, those before its last change, and who gave them."""
+"""Why a cell has its value: its votes, before and since its last change, and their machines."""
 
 from __future__ import annotations
 
@@ -19,9 +19,7 @@ from protocol.arrays import AnyArray
 from protocol.queries.reasons import CellReasons, Votes
 from protocol.site.geometry import BLOCK_CELLS
 
-LAYERS = tuple(
-    name for name in cell_layers.LAYERS if name not in ("age_s", "changed_s")
-)  # which follow from the stamps
+LAYERS = tuple(name for name in cell_layers.LAYERS if name not in ("age_s", "changed_s"))  # they follow from stamps
 MACHINE_SHIFT = 58  # the top six bits of a name's hash choose its bit
 
 
@@ -30,8 +28,7 @@ def reasons(
 ) -> CellReasons:
     """What is known of one cell (column, row).
 
-    names: of all machines whose samples may be in the map; of those whose bit is set in the cell, one may have been
-    somewhere else only, where more than a few machines work: 64 bits are for all names.
+    names: of machines in the map; they share 64 bits, so with many machines one may be listed wrongly.
     """
     block = cell[0] // BLOCK_CELLS, cell[1] // BLOCK_CELLS
     pages = view.pages.get(block, NO_PAGES)
@@ -63,12 +60,12 @@ def reasons(
 
 
 def machine_bit(name: str) -> int:
-    """Which bit of a cell says that this machine drove over it."""
+    """Bit of a machine in a cell."""
     return name_hash(name) >> MACHINE_SHIFT
 
 
 def _one(sums: ev.Evidence, place: int) -> ev.Evidence:
-    """The evidence of one cell of one block, arrays (1, 1, ...)."""
+    """One cell of one block, arrays (1, 1, ...)."""
     parts = {item.name: getattr(sums, item.name)[:, place : place + 1] for item in dataclasses.fields(sums)}
     return ev.Evidence(**parts)
 

@@ -1,4 +1,4 @@
-"""How much ground of a window is driven and known, by age and by machine."""
+"""Driven and known ground of a window, by age and machine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LAYERS = ("visits", "resistance")
 def coverage(
     view: View, window: CellWindow | None, names: Iterable[str], cell_m: float, config: ServerConfig
 ) -> Coverage:
-    """Count the cells of a window, None for all of the view; names: of all machines whose samples may be in the map."""
+    """Count cells of a window or the whole view; names: of machines in the map."""
     bits = {name: np.uint64(1) << np.uint64(machine_bit(name)) for name in names}
     since_ns = {name: view.stamp_ns - seconds * 10**9 for name, seconds in SINCE_S.items()}
     counts = dict.fromkeys(("driven", "known", *since_ns, *(f"by {name}" for name in bits)), 0)
@@ -54,7 +54,7 @@ def coverage(
 
 
 def _within(block: Block, window: CellWindow | None) -> Bools:
-    """Which cells (256,) of a block lie in a window, row by row."""
+    """Cells (256,) of a block in a window, by rows."""
     if window is None:
         return np.ones(BLOCK_CELLS * BLOCK_CELLS, bool)
     column, row = (BLOCK_CELLS * place + np.arange(BLOCK_CELLS) for place in block)

@@ -1,4 +1,4 @@
-"""Machines of the site by name: what their newest samples say of them, followed in the journal as it is asked for."""
+"""Machines by name: mass and speed from their newest samples, followed on demand in the journal."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteMachine
 from protocol.units import HOUR_NS, MINUTE_NS
 
-LOOK_BACK_NS = HOUR_NS  # before the time that is asked about: what a machine weighed earlier says nothing
-SLOT_NS = 10 * MINUTE_NS  # a machine's fastest sample is remembered for so long a time each
-PACE_MPS = 1.0  # who drove no faster in an hour stood about: that is not how it drives
+LOOK_BACK_NS = HOUR_NS  # before the time asked about; older masses say nothing
+SLOT_NS = 10 * MINUTE_NS  # span of one remembered fastest sample
+PACE_MPS = 1.0  # slower machines only stood about
 MOST_SHOWN = 8  # names in a refusal
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What samples of one machine and slot of time say: mass of the newest that has one, NaN without; fastest."""
+    """A machine's samples in a slot: newest known mass, or NaN; fastest speed."""
 
     stamp_ns: int
     mass_kg: float
     fastest_mps: float
 
     def joined(self, other: Seen) -> Seen:
-        """Both together."""
+        """Combine both."""
         newer = max((one for one in (self, other) if not math.isnan(one.mass_kg)), key=_stamp, default=self)
         return Seen(newer.stamp_ns, newer.mass_kg, max(self.fastest_mps, other.fastest_mps))
 
 
 class _Followed:
-    """What was seen of machines, by the hash of their name and slot."""
+    """Seen machines, by hash of name and slot."""
 
     def __init__(self, store: str = "") -> None:
         self.store, self.row = store, 0
@@ -60,7 +60,7 @@ class _Followed:
             self.slots[name, slot] = old.joined(seen) if old else seen
 
     def before(self, name: str, until_ns: int) -> Seen | None:
-        """All that was seen of a machine in the hour before a time."""
+        """A machine in the hour before a time."""
         hashed, last = name_hash(name), until_ns // SLOT_NS
         slots = (self.slots.get((hashed, slot)) for slot in range(last - LOOK_BACK_NS // SLOT_NS, last + 1))
         out: Seen | None = None
@@ -69,21 +69,21 @@ class _Followed:
         return out
 
     def forget(self, until_ns: int) -> None:
-        """Drop what is too old for a question about this time."""
+        """Drop what is too old for this time."""
         first = until_ns // SLOT_NS - LOOK_BACK_NS // SLOT_NS
         self.slots = {key: seen for key, seen in self.slots.items() if key[1] >= first}
 
 
 class NamedMachines:
-    """Machines of one source; for any thread."""
+    """Machines of one source. Thread-safe."""
 
     def __init__(self, source: MapSource) -> None:
         self._source, self._lock, self._now = source, threading.Lock(), _Followed()
 
     def resolve(self, machine: RouteMachine | NamedMachine, as_of_ns: int | None) -> RouteMachine:
-        """A machine with all its values; QueryError where the site does not know its name.
+        """A machine with all values; QueryError for an unknown name.
 
-        What its samples do not say is as of the kind that its name begins with (`truck-3`), else as of a loader.
+        Missing values are of the kind that its name begins with (`truck-3`), else of a loader.
         """
         if isinstance(machine, RouteMachine):
             return machine
@@ -111,7 +111,7 @@ class NamedMachines:
             self._follow(followed, as_of_ns - LOOK_BACK_NS, as_of_ns, row)
             return followed.before(name, as_of_ns)
         with self._lock:
-            if self._now.store != store or self._now.row > row:  # another store, or one that was restored
+            if self._now.store != store or self._now.row > row:  # another store, or a restored one
                 self._now = _Followed(store)
             if self._now.row < row:
                 self._follow(self._now, newest_ns - LOOK_BACK_NS - SLOT_NS, MAX_STAMP_NS, row)

@@ -1,4 +1,4 @@
-"""Places that no map of a site has: numbers of another frame in a query of metres."""
+"""Refuses places far off a site, such as numbers of another frame."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from protocol.site.site_config import SiteConfig
 
 
 def check_on_site(query: MapQuery[Any], site: SiteConfig, bounds: Callable[[], Sequence[int] | None]) -> None:
-    """Refuse a query of places beyond the site's extent, and of an area that lies there as a whole.
+    """Refuse places and areas beyond the site's extent.
 
-    bounds: west, south, east and north of the map in cells, None while it is empty; asked for the refusal alone.
+    bounds: west, south, east, north of the map in cells, None if empty; used in refusals.
     """
     for name, places in _places(query).items():
         for x_m, y_m in places:

@@ -1,7 +1,7 @@
-"""Map queries as they come in over Zenoh: each waits for the row that it asks for, then for a thread, and is answered.
+"""Map queries from Zenoh: each waits for its journal row, then for a thread, and is answered.
 
-Callbacks only hand a query on: one that works stalls the session. The threads that answer have one budget of bytes for
-all answers that wait or are in work, since Zenoh does not tell who asks.
+Callbacks only pass queries on: one that works stalls the session. Answers share one budget of bytes, because Zenoh does
+not tell who asks.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from protocol.queries.request import parameters_of
 from protocol.queries.requests import QUERIES, parse_query
 from protocol.wire import keys
 
-END_S = 1.0  # at the end, what is in work may take so long; nobody waits for an answer longer than for the end
+END_S = 1.0  # longest wait for running answers at the end
 MIN_RETRY_S, MAX_RETRY_S = 0.5, 30.0
-Work = tuple[int, Callable[[], None]]  # size, what to do
-Order = Callable[[Mapping[int, Work]], int]  # which of those that wait is next
+Work = tuple[int, Callable[[], None]]  # size and task
+Order = Callable[[Mapping[int, Work]], int]  # the next of those waiting
 
 
 class AnswerPool:
-    """Work for some threads.
+    """Tasks for several threads.
 
-    The first takes the smallest answer that waits, so that small ones pass large ones; further threads take the oldest,
-    so that large ones have their turn.
+    The first takes the smallest waiting task, so small answers pass large ones; others take the oldest, so large ones
+    get their turn.
     """
 
     def __init__(self, name: str, threads: int, budget: int) -> None:
-        """budget: of the sizes of all answers that wait or are in work, in the unit that callers choose."""
+        """budget: total size of waiting and running tasks."""
         self._budget, self._size = budget, 0
-        self._waiting: dict[int, Work] = {}  # by number, the oldest first
+        self._waiting: dict[int, Work] = {}  # by number, oldest first
         self._numbers = itertools.count()
-        self._mean_s = 0.0  # of an answer
+        self._mean_s = 0.0  # duration of an answer
         self._closed = False
         self._news = threading.Condition()
         self._threads = [
@@ -54,7 +54,7 @@ class AnswerPool:
             thread.start()
 
     def submit(self, size: int, work: Callable[[], None]) -> None:
-        """Have `work` done by a thread; QueryError if the budget is spent."""
+        """Queue `work`; QueryError if the budget is exceeded."""
         with self._news:
             if self._size + size > self._budget:
                 expected_s = self._mean_s * len(self._waiting) / len(self._threads)
@@ -65,7 +65,7 @@ class AnswerPool:
             self._news.notify()
 
     def close(self) -> None:
-        """Drop what waits, and let what is in work end."""
+        """Drop waiting tasks, and let running ones end."""
         with self._news:
             self._closed = True
             self._waiting.clear()
@@ -81,7 +81,7 @@ class AnswerPool:
                 work()
             except Exception:  # a bug must not end the thread
                 log.exception("answer failed")
-            del taken, work  # the query with it: nobody is left to wait for an answer
+            del taken, work  # frees the query with it
             with self._news:
                 self._size -= size
                 self._mean_s += 0.1 * (time.monotonic() - began_s - self._mean_s)
@@ -103,8 +103,8 @@ def _oldest(waiting: Mapping[int, Work]) -> int:
     return next(iter(waiting))
 
 
-ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 pieces, or 2000 points
-MOST_PAST = 16  # that wait or are in work
+ANSWER_BYTES = 2**25  # of all waiting and running answers: 40 pieces, or 2000 points
+MOST_PAST = 16  # waiting or running
 MAX_QUESTION = 4096  # bytes of a query's parameters
 WITH_PLACES = {
     name
@@ -116,20 +116,20 @@ log = logging.getLogger("mapserver.query.queryable")
 
 
 class Replies:
-    """Answers and refusals on their way out, each with who gives it."""
+    """Sends answers and refusals, with their origin."""
 
     def __init__(self, source: MapSource) -> None:
         self._source = source
 
     def submit(self, pool: AnswerPool, size: int, asked: zenoh.Query, answer: Callable[[], bytes]) -> None:
-        """Have a query answered by a thread of a pool."""
+        """Have a query answered by a pool."""
         try:
             pool.submit(size, lambda: self._reply(asked, answer))
         except QueryError as error:
             self.refuse(asked, error)
 
     def refuse(self, asked: zenoh.Query, error: QueryError) -> None:
-        """Say why a query is not answered."""
+        """Send the reason of a refusal."""
         self._source.count(f"refused_query_{error.reason}")
         with asked:
             _send(asked, lambda: asked.reply_err(encode_error(error)))
@@ -150,14 +150,14 @@ class Replies:
 
 
 class MapQueryable:
-    """Answers the map queries on a key expression of a session, until closed."""
+    """Answers map queries on a key expression."""
 
     def __init__(self, session: zenoh.Session, key: str, source: MapSource, answers: Answers) -> None:
         self._source, self._answers, self._replies = source, answers, Replies(source)
         self._now = AnswerPool("query", source.config.query_threads, ANSWER_BYTES)
-        # Another one: a fold of the past must not keep the map as it is from answering.
+        # separate, so that folds of the past do not delay present answers
         self._past = AnswerPool("past", 1, MOST_PAST)
-        # And what takes much memory to make, one after the other.
+        # large ones, one at a time, to save memory
         self._large = AnswerPool("large", 1, ANSWER_BYTES)
         self._queryable = session.declare_queryable(key, self._on_query)
 
@@ -166,12 +166,12 @@ class MapQueryable:
         self._queryable.undeclare()  # type: ignore[no-untyped-call]
 
     def close(self) -> None:
-        """Drop what waits, and let what is in work end; after `stop`."""
+        """Drop waiting queries, and let running ones end; after `stop`."""
         for pool in (self._now, self._past, self._large):
             pool.close()
 
     def _on_query(self, asked: zenoh.Query) -> None:
-        """Parse a query and let it wait, without a thread, for the journal row that it asks for; then for a thread."""
+        """Parse a query; it waits for its row without a thread, then for a thread."""
         try:
             name, parameters = question(asked)
             query = parse_query(name, parameters)
@@ -195,7 +195,7 @@ class MapQueryable:
 
 
 def question(asked: zenoh.Query) -> tuple[str, dict[str, str]]:
-    """Name and parameters. QueryError for what no client sends: what waits is kept in memory."""
+    """Name and parameters; QueryError if too large, because waiting queries stay in memory."""
     name, parameters = keys.query_of(str(asked.key_expr)), str(asked.parameters)
     most = PLACES_BYTES if name in WITH_PLACES else MAX_QUESTION
     if len(parameters) > most or asked.payload:

@@ -1,8 +1,7 @@
-"""Regions in pieces: how they are cut, and the views that are kept while a reader takes piece after piece.
+"""Regions in pieces: cutting, and views kept while a reader takes them.
 
-One answer is so small that the router can hold it for a reader that does not read (protocol/wire/session.py): nobody
-else waits for that one. All pieces are of one version of the map, so the pages that they are read from are kept, which
-costs little: pages never change, and the grid shares them.
+An answer is small enough for the router to hold it for a slow reader (protocol/wire/session.py), so nobody else waits.
+All pieces are of one map version, so its pages are kept, at little cost: they are immutable, and shared with the grid.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from protocol.queries.places import Place
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 PIECE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
-READ_BYTES = 2**24  # layers of cells that one answer is made of, where larger cells are their means
-MOST_OPEN = 16  # regions that are read at the same time
-IDLE_S = 30.0  # a region of which nobody takes a piece for so long makes room; one piece takes 20 s at 300 kbit/s
-OPEN_S = 600.0  # ... and one that is open for so long, since its pages leave the grid one by one
+READ_BYTES = 2**24  # of cell layers per answer, if larger cells are their means
+MOST_OPEN = 16  # regions read at the same time
+IDLE_S = 30.0  # without a request until a region is dropped; a piece takes 20 s at 300 kbit/s
+OPEN_S = 600.0  # until an open region is dropped, as its pages leave the grid
 
 
 @dataclass(frozen=True)
 class RegionReading:
-    """What a region is read from: layers, and the map that they are read from, less another one if there are two.
+    """Sources of a region: layers, and a map, or the difference of two.
 
-    window: in cells of the answer, each of `count` cells of the map to a side. outline: outside of it nothing is known.
+    window: in the answer's cells, `count` map cells to a side. outline: unknown outside.
     """
 
     window: CellWindow
@@ -44,15 +43,15 @@ class RegionReading:
 
     @property
     def past_blocks(self) -> int:
-        """Blocks of maps of the past, whose pages nobody else has."""
+        """Blocks of past maps, whose pages are not shared."""
         return sum(len(look.pages) for look in self.looks if look.grid is None)
 
 
 @dataclass(frozen=True)
 class PieceGrid:
-    """Pieces of a window, row by row from its south-western corner; edges lie between blocks, where they can.
+    """Pieces of a window, by rows from the south-west; edges between blocks where possible.
 
-    width, height: of a piece [cells]; step: between the places where edges may lie.
+    width, height: of a piece [cells]; step: grid of edges [cells].
     """
 
     window: CellWindow
@@ -62,9 +61,9 @@ class PieceGrid:
 
     @classmethod
     def of_layers(cls, window: CellWindow, layers: int, count: int = 1) -> PieceGrid:
-        """Pieces with at most PIECE_BYTES each, made of READ_BYTES at most: square, unless the window is narrow.
+        """Square pieces of at most PIECE_BYTES, read from READ_BYTES; longer in narrow windows.
 
-        count: cells of the map to a side of one of the window. QueryError where one alone is made of more.
+        count: map cells to a side of the window's. QueryError if one exceeds READ_BYTES.
         """
         cells = min(PIECE_BYTES // (4 * layers), READ_BYTES // (4 * layers * count**2))
         step = 1 if count > 1 else BLOCK_CELLS
@@ -84,17 +83,17 @@ class PieceGrid:
 
     @property
     def count(self) -> int:
-        """How many pieces there are."""
+        """Number of pieces."""
         return len(self._columns) * len(self._rows)
 
     def piece(self, number: int) -> CellWindow:
-        """One of them."""
+        """One piece."""
         left, right = self._columns[number % len(self._columns)]
         bottom, top = self._rows[number // len(self._columns)]
         return CellWindow(left, bottom, right - left, top - bottom)
 
     def place(self, number: int, cursor: int) -> Piece:
-        """Where one of them lies."""
+        """Position of a piece."""
         piece, whole = self.piece(number), self.window
         corner = (piece.column - whole.column, piece.row - whole.row)
         return Piece(cursor, number, self.count, *corner, whole.columns, whole.rows)
@@ -113,7 +112,7 @@ def _whole(cells: int, step: int) -> int:
 
 
 def _cut(first: int, count: int, length: int, step: int) -> list[tuple[int, int]]:
-    """Begin and end of each piece of an axis."""
+    """Begin and end of pieces along an axis."""
     edges = [first, *range(first // step * step + length, first + count, length), first + count]
     return list(pairwise(edges))
 
@@ -127,14 +126,14 @@ class _Open:
 
 
 class OpenRegions:
-    """Regions of which readers take pieces, by cursor."""
+    """Regions being read, by cursor."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._open: dict[int, _Open] = {}
 
     def make_room(self, past_blocks: int = 0) -> None:
-        """Forget what is read or left; QueryError while too many regions are being read, or too much of the past."""
+        """Drop finished and abandoned regions; QueryError if too many, or too much of the past, are being read."""
         with self._lock:
             self._forget()
             while self._is_full(past_blocks):
@@ -149,7 +148,7 @@ class OpenRegions:
         return len(self._open) >= MOST_OPEN or bool(past_blocks and kept and kept + past_blocks > MOST_BLOCKS)
 
     def open(self, reading: RegionReading) -> int:
-        """Keep what a region is read from; returns its cursor. QueryError as `make_room`."""
+        """Keep a region's sources; returns its cursor. QueryError as `make_room`."""
         self.make_room(reading.past_blocks)
         cursor, now_s = 1 + secrets.randbelow(2**48), time.monotonic()
         with self._lock:
@@ -157,7 +156,7 @@ class OpenRegions:
         return cursor
 
     def reading(self, cursor: int, number: int) -> tuple[RegionReading, PieceGrid]:
-        """What a piece is read from; QueryError if that is not kept any more, or there is no such piece."""
+        """Sources of a piece; QueryError if expired or out of range."""
         with self._lock:
             self._forget()
             one = self._open.get(cursor)

@@ -1,7 +1,7 @@
-"""Road maps: roads, the tally of what drove on them, and the changes of their ground; now, and as of any time.
+"""Road maps: roads, their traffic tally and ground changes, now and as of any time.
 
-The tally follows the journal; roads and changes are made from the same version of the map, beside the questions: who
-asks is answered from the newest that are made, while these are of the last seconds.
+The tally follows the journal. Roads and changes are made from one map version in the background; queries use the
+newest, a few seconds old.
 """
 
 from __future__ import annotations
@@ -42,26 +42,24 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 from protocol.units import HOUR_NS
 
 log = logging.getLogger("mapserver.query.road_maps")
-# How much older than a question its roads may be: a repair is seen after two or three passes, which take minutes, and a
-# road is planned on for minutes more. A new map each second costs whoever asks, and those who wait for him, 0.1 s.
+# Largest age of roads in answers [s]: repairs need minutes to be seen, and roads are planned on for minutes. Making
+# them every second would cost queries 0.1 s.
 FRESH_S = 10.0
-# Where roads are soon made they are newer: no older than so many times what the last took, 1 % of the time for whoever
-# asks. So a small site, or one that has just begun, is answered of what came in a moment ago.
+# Largest age relative to the last making, 1 % of the time, so that small or new sites get fresh answers.
 CHEAP = 100
-COSTLY = 20  # likewise the least: roads of a large map, which take seconds, are older, and take no more than 5 %
-SPARE = 3  # times the last making: so long before roads are too old the next one begins, its own time twice with it
-ASKED_S = 600.0  # so long after the last question roads are still made for the next one
-PATIENCE_S = 2.0  # how long a picture waits for the first roads before it goes without
-END_S = 1.0  # at the end, what is being made may take so long; nobody waits for it
-LOOK_BACK_NS = 30 * 24 * HOUR_NS  # before the site's now, of traffic: older journals are not read for it
+COSTLY = 20  # the same at least, so that large maps, which take seconds, spend no more than 5 %
+SPARE = 3  # of the last making: begin before roads are too old, by this factor with the making
+ASKED_S = 600.0  # after the last question, roads are still made
+PATIENCE_S = 2.0  # of a picture for the first roads
+END_S = 1.0  # for a running making at the end
+LOOK_BACK_NS = 30 * 24 * HOUR_NS  # of traffic before the site's now; older rows are not read
 
 
 @dataclass(frozen=True)
 class RoadMap:
-    """Roads of one version of the map, and the tally that goes with it.
+    """Roads of one map version, with their tally.
 
-    pages: the evidence that the roads are of; grid: the same, of the map as it is. changes: of the ground of segments,
-    the newest first.
+    pages: evidence of the roads; grid: the same, of the present map. changes: of segments' ground, newest first.
     """
 
     segments: SegmentTable
@@ -77,22 +75,22 @@ class RoadMap:
 
     @cached_property
     def ages(self) -> Ages:
-        """Since when cells of roads are as they are, where their ground changed."""
+        """Start of the present ground of changed road cells."""
         return ages(self.segments, self.changes, self.cell_m)
 
     @cached_property
     def still(self) -> StillMap:
-        """The map that the roads are of, of one that is not of the past."""
+        """The present map of these roads."""
         assert self.grid
         return StillMap(self.grid, self.version, self.stamp_ns, self.ages)
 
     @cached_property
     def ledger(self) -> Ledger:
-        """Of all hours that are remembered."""
+        """Of all remembered hours."""
         return self.ledgers.ledger(self.tally, HOUR_NS)
 
     def hours_with_driving(self, from_ns: int, to_ns: int) -> tuple[Ledger, float]:
-        """The ledger of hours that begin in from_ns <= time < to_ns, and how many: of the running one a part."""
+        """The ledger of hours that begin in from_ns <= time < to_ns, and their number, the running one in part."""
         whole = from_ns <= 0 and to_ns > self.stamp_ns
         traffic = self.ledger if whole else self.ledgers.ledger(self.tally, HOUR_NS, from_ns, to_ns)
         slots = np.unique(traffic.rows["slot"])
@@ -100,7 +98,7 @@ class RoadMap:
         return traffic, float(np.maximum(ends - slots * HOUR_NS, 0).sum() / HOUR_NS)
 
     def since_ns(self) -> Ints:
-        """Since when (k,) the ground of segments is as it is: the last change, or the first hour with a measurement."""
+        """Start (k,) of segments' present ground: last change, or first measured hour."""
         rows = self.ledger.rows[self.ledger.rows["measured"] > 0]
         out = np.zeros(len(self.segments.ids), np.int64)
         known, first = np.unique(rows["segment"], return_index=True)  # by segment, then slot
@@ -111,12 +109,12 @@ class RoadMap:
 
     @cached_property
     def last_changes(self) -> dict[int, Repair]:
-        """The last change of each segment that changed."""
+        """The last change of each changed segment."""
         return {change.segment: change for change in reversed(self.changes)}
 
 
 class Traffic:
-    """What drove, in sums by hour and by pass."""
+    """Traffic by hour and by pass."""
 
     def __init__(self) -> None:
         self.tally, self.passes = Tally(), PassTally()
@@ -129,10 +127,7 @@ class Traffic:
 
 @dataclass(frozen=True)
 class _Newest:
-    """The newest roads that are made, and when the map was last looked at that they are of [s of the clock].
-
-    took_s: what making them took.
-    """
+    """The newest roads, when the map was last checked [s], and how long they took."""
 
     roads: RoadMap
     looked_s: float
@@ -141,7 +136,7 @@ class _Newest:
 
 @contextmanager
 def _journal_read() -> Iterator[None]:
-    """Say what is wrong with a journal to who asks."""
+    """Turn journal errors into a QueryError."""
     try:
         yield
     except StoreError as error:
@@ -149,47 +144,47 @@ def _journal_read() -> Iterator[None]:
 
 
 class RoadMaps:
-    """Makes road maps of one source. For any thread; one at a time makes those of now.
+    """Road maps of one source. Thread-safe; one thread at a time makes present ones.
 
-    made, made_s: how many of these, and how long it took.
+    made, made_s: their number and total time.
     """
 
     def __init__(self, source: MapSource, clock: Callable[[], float] = time.monotonic) -> None:
-        """clock: steady, in seconds."""
+        """clock: monotonic [s]."""
         self._source, self._cell_m, self._config = source, source.site.cell_m, source.config
         self._clock = clock
         self._lock = threading.Lock()
         self._skeletons = Skeletons(self._cell_m)
         self._newest: _Newest | None = None
         self.made, self.made_s = 0, 0.0
-        self._asked_s = -math.inf  # nobody has
+        self._asked_s = -math.inf  # never
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self._begin("", NO_FACTS)
 
     def _begin(self, store: str, facts: Facts) -> None:
-        """Follow the journal anew."""
+        """Restart following the journal."""
         self._traffic, self._followed, self._with = Traffic(), 0, (store, facts)
 
     def start(self) -> None:
-        """Make roads beside the questions from here on, until closed; without this, those who ask make them.
+        """Make roads in the background; without this, queries make them.
 
-        Those of a map that is there already are made at once: whoever asks first would wait for its whole journal.
+        An existing map gets roads at once: the first query would wait for its whole journal.
         """
-        with suppress(QueryError):  # of a follower, which has no map yet
+        with suppress(QueryError):  # a follower without a map yet
             if self._source.run(lambda state: state.version.row):
                 self._ask()
         self._thread = threading.Thread(target=self._run, name="roads", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Make no more."""
+        """Make no more roads."""
         self._ended.set()
         if self._thread:
             self._thread.join(END_S)
 
     def read(self, as_of_ns: int | None = None, machine: str = "") -> RoadMap:
-        """The roads as of a time, or of the last seconds; machine: with its traffic alone. Raises QueryError."""
+        """Roads as of a time, or recent ones; machine: only its traffic. Raises QueryError."""
         if machine and not self._source.run(lambda state: machine in state.machines()):
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing")
         with _journal_read():
@@ -199,13 +194,13 @@ class RoadMaps:
             return self._alone(roads, machine) if machine else roads
 
     def reach(self, row: int) -> None:
-        """Have roads of this journal row or a later one from here on. Raises QueryError."""
+        """Require roads of this journal row or later. Raises QueryError."""
         with _journal_read(), self._lock:
             if not self._newest or self._newest.roads.version.row < row:
                 self._now()
 
     def lately(self) -> Ages:
-        """Ages of cells as of some seconds ago, for pictures, which wait for none that others make but the first."""
+        """Recent ages of cells, for pictures, which wait only for the first roads."""
         try:
             with _journal_read():
                 asked_s = self._ask()
@@ -214,12 +209,12 @@ class RoadMaps:
                         self._now()
                     finally:
                         self._lock.release()
-        except QueryError as error:  # asked again with the next picture
+        except QueryError as error:  # the next picture asks again
             log.warning("no road map reason=%s problem=%r", error.reason, str(error))
         return self._newest.roads.ages if self._newest else {}
 
     def renew(self) -> None:
-        """Make roads of the map as it is, unless nobody has asked for long."""
+        """Make present roads, unless there were no questions for long."""
         if self._clock() - self._asked_s < ASKED_S:
             with _journal_read(), self._lock:
                 self._now()
@@ -230,16 +225,16 @@ class RoadMaps:
             began_s = self._clock()
             try:
                 self.renew()
-            except QueryError as error:  # who asks is answered so, too
+            except QueryError as error:  # queries get the same answer
                 log.info("no road map reason=%s problem=%r", error.reason, str(error))
             except Exception:  # a bug must not end the thread
                 log.exception("no road map")
             took_s = self._clock() - began_s
-            # as seldom as may be, since all layers near a new sample are derived again; and half of the time at most
+            # rarely, because all layers near new samples are derived again; at most half of the time
             wait_s = max(max(FRESH_S, COSTLY * took_s) - SPARE * took_s, took_s)
 
     def _lately(self) -> RoadMap:
-        """The newest roads, if not too old: who waits for those in the making takes them, if begun in time."""
+        """The newest roads, if fresh, or those being made."""
         asked_s = self._ask()
         if roads := self._fresh(asked_s):
             return roads
@@ -247,12 +242,12 @@ class RoadMaps:
             return self._fresh(asked_s) or self._now()
 
     def _ask(self) -> float:
-        """Note that somebody asks, and when."""
+        """Note a question, and its time."""
         self._asked_s = self._clock()
         return self._asked_s
 
     def _fresh(self, asked_s: float) -> RoadMap | None:
-        """Roads that a question of this time may be answered from: of the map's facts, and of its last seconds."""
+        """Roads fresh enough for a question of this time, and of the map's facts."""
         newest = self._newest
         if newest is None:
             return None
@@ -263,7 +258,7 @@ class RoadMaps:
         return newest.roads if is_of_map and in_time else None
 
     def view(self, window: CellWindow, reach: int, as_of_ns: int | None) -> View:
-        """Evidence of a window and of `reach` blocks around, with the ages of roads; now, or as of a time."""
+        """Evidence of a window and `reach` blocks around, with ages of roads, now or as of a time."""
         roads, (left, bottom, right, top) = self.read(as_of_ns), _blocks_of(surroundings(window, reach))
         near = {
             block: pages
@@ -273,9 +268,9 @@ class RoadMaps:
         return View(near, roads.version, roads.stamp_ns, roads.ages)
 
     def _now(self) -> RoadMap:
-        """Make roads of the map as it is, unless those that are made are of it."""
+        """Make present roads, unless the newest are."""
         looked_s, newest = self._clock(), self._newest
-        # the version alone first: pages of all blocks take milliseconds of whoever owns them
+        # version first, because pages of all blocks cost their owner milliseconds
         if newest and newest.roads.version == self._source.run(lambda state: state.version):
             self._newest = replace(newest, looked_s=looked_s)
             return newest.roads
@@ -287,7 +282,7 @@ class RoadMaps:
         ledgers = Ledgers(segments(network(self._skeletons.skeleton(grid.all_pages))))
         made = self._map(ledgers, self._traffic, grid.all_pages, facts, version, newest_ns)
         roads = replace(made, grid=grid)
-        _ = roads.still  # with the ages, here and not in the first question
+        _ = roads.still  # here rather than in the first query
         took_s = self._clock() - looked_s
         self._newest = _Newest(roads, looked_s, took_s)
         self.made, self.made_s = self.made + 1, self.made_s + took_s
@@ -305,7 +300,7 @@ class RoadMaps:
         return self._map(ledgers, traffic, pages, facts, version, as_of_ns)
 
     def _alone(self, roads: RoadMap, machine: str) -> RoadMap:
-        """The same roads with the traffic of one machine; read from the journal, as nothing of it is kept apart."""
+        """The same roads with one machine's traffic, read from the journal."""
         traffic = Traffic()
         self._follow(traffic, roads.facts, roads.stamp_ns, 0, roads.version.row, machine=machine)
         return self._map(roads.ledgers, traffic, roads.pages, roads.facts, roads.version, roads.stamp_ns)
@@ -320,7 +315,7 @@ class RoadMaps:
         to_ns: int = MAX_STAMP_NS,
         machine: str = "",
     ) -> None:
-        """Take journal rows after < row <= until into the traffic, of samples up to `to_ns`, of one machine or all."""
+        """Add rows after < row <= until to the traffic: samples up to `to_ns`, of one machine or all."""
         if after >= until:
             return
         begin_ns = max(0, newest_ns - LOOK_BACK_NS) // HOUR_NS * HOUR_NS
@@ -335,7 +330,7 @@ class RoadMaps:
     def _map(
         self, ledgers: Ledgers, traffic: Traffic, pages: Pages, facts: Facts, version: MapVersion, stamp_ns: int
     ) -> RoadMap:
-        """Put together; the look back is cut here, where it does not depend on when the journal was followed."""
+        """Assemble a road map; limits the look back, independently of when the journal was followed."""
         first = max(0, stamp_ns - LOOK_BACK_NS) // HOUR_NS
         table = between(traffic.tally.table(), first, MAX_STAMP_NS // HOUR_NS + 1)
         changes, _ = repairs(traffic.passes.passes(ledgers, first * HOUR_NS))
@@ -359,15 +354,15 @@ def _pages(grid: Grid) -> Pages:
 
 
 def _blocks_of(window: CellWindow) -> tuple[int, int, int, int]:
-    """First and last column and row of the blocks of a window that begins and ends with blocks."""
+    """First and last block column and row of a window aligned to blocks."""
     n = BLOCK_CELLS
     left, bottom = window.column // n, window.row // n
     return left, bottom, left + window.columns // n - 1, bottom + window.rows // n - 1
 
 
 def warm_up(config: FoldConfig) -> None:
-    """Compile the kernels of roads, or read them from their cache, before somebody who asks waits for them."""
-    rows = np.zeros(3 * 160, SAMPLE_DTYPE)  # three passes along 80 m, which are a road
+    """Compile the kernels of roads, or load them, before a query waits for them."""
+    rows = np.zeros(3 * 160, SAMPLE_DTYPE)  # a road: three passes along 80 m
     rows["x_m"], rows["distance_m"], rows["speed_mps"] = np.tile(np.arange(160) / 2, 3), 0.5, 5.0
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.25
     rows["c_rr"], rows["c_rr_var"], rows["mass_kg"] = 0.02, 1e-6, 1e4

@@ -1,4 +1,4 @@
-"""Queries about roads answered: segments with what drove on them, and the worklist."""
+"""Answers about roads: segments with traffic, and the worklist."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery
 from protocol.site.geometry import Bounds
 from protocol.units import DAY_NS, HOUR_NS, JOULE_PER_KWH
 
-MOST_SEGMENTS = 10_000  # of one answer: 250 km of roads, 3 MB
-MOST_CHANGES = 1000  # of one worklist, the newest
-LINE_POINTS = 5  # a point of a line is a metre from the next; one in so many is told
-Read = Callable[[int | None, str], RoadMap]  # as of a time, with the traffic of one machine: as `RoadMaps.read`
+MOST_SEGMENTS = 10_000  # per answer: 250 km of roads, 3 MB
+MOST_CHANGES = 1000  # per worklist, the newest
+LINE_POINTS = 5  # every so many points of a line, a metre apart, are sent
+Read = Callable[[int | None, str], RoadMap]  # as `RoadMaps.read`: as of a time, with one machine's traffic
 
 
 def segments(read: Read, query: SegmentsQuery) -> answers.Segments:
-    """Roads, and what drove on them."""
+    """Roads with their traffic."""
     roads, traffic, hours = _read(read, query)
     rows = _Records(roads, traffic, _lost(roads, traffic, 0.0), hours)
     chosen = _inside(roads.segments, query.bounds)
@@ -41,7 +41,7 @@ def segments(read: Read, query: SegmentsQuery) -> answers.Segments:
 
 
 def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
-    """Where work pays."""
+    """Road sections worth grading."""
     roads, traffic, hours = _read(read, query)
     lost, saved_j = _lost(roads, traffic, query.target), _saved_j(roads, traffic, query.target)
     saved_kwh_ph = {change: joules / max(hours, 1e-9) / JOULE_PER_KWH for change, joules in saved_j.items()}
@@ -60,7 +60,7 @@ def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
 
 
 def _read(read: Read, query: RoadQuery[Any]) -> tuple[RoadMap, Ledger, float]:
-    """The roads that a query is about, the ledger of its hours, and how many hours these are."""
+    """Roads of a query, its ledger, and its hours."""
     roads = read(query.as_of_ns, query.machine)
     from_ns, to_ns = query.from_ns or 0, query.to_ns or 2**62
     return roads, *roads.hours_with_driving(from_ns // HOUR_NS * HOUR_NS, to_ns)
@@ -71,13 +71,13 @@ def _version(roads: RoadMap) -> tuple[str, int, int, int]:
 
 
 def _lost(roads: RoadMap, traffic: Ledger, target: float) -> Losses:
-    """What is lost with this traffic, on ground as it is since its last change."""
+    """Losses of this traffic on ground as of its last change."""
     _, after = _levels(roads.segments, roads.last_changes.values())
     return losses(traffic, roads.segments, target, after)
 
 
 def _saved_j(roads: RoadMap, traffic: Ledger, target: float) -> dict[Repair, float]:
-    """Work that each change saves of the same traffic [J]: one change of each segment at a time."""
+    """Work [J] that each change saves for this traffic, one change per segment at a time."""
     out: dict[Repair, float] = {}
     left = list(roads.changes)
     while left:
@@ -91,7 +91,7 @@ def _saved_j(roads: RoadMap, traffic: Ledger, target: float) -> dict[Repair, flo
 
 
 def _levels(roads: SegmentTable, changes: Iterable[Repair]) -> tuple[Floats, Floats]:
-    """c_rr of segments (k,) before and after these changes, NaN where there is none."""
+    """c_rr (k,) before and after these changes, NaN for none."""
     before, after = np.full((2, len(roads.ids)), np.nan)
     for change in changes:
         before[change.segment], after[change.segment] = change.before, change.after
@@ -99,7 +99,7 @@ def _levels(roads: SegmentTable, changes: Iterable[Repair]) -> tuple[Floats, Flo
 
 
 def _inside(roads: SegmentTable, bounds: Bounds | None) -> set[int]:
-    """Segments whose middle lies in a rectangle."""
+    """Segments with their middle in a rectangle."""
     if bounds is None:
         return set(range(len(roads.ids)))
     middle = roads.points[(roads.ends[:-1] + roads.ends[1:]) // 2] if len(roads.ids) else roads.points
@@ -109,7 +109,7 @@ def _inside(roads: SegmentTable, bounds: Bounds | None) -> set[int]:
 
 
 class _Records:
-    """Records of segments, by number. lost: on them, in so many hours."""
+    """Records of segments, by number. lost: in these hours."""
 
     def __init__(self, roads: RoadMap, traffic: Ledger, lost: Losses, hours: float) -> None:
         self._segments, self.lost, self.hours = roads.segments, lost, max(hours, 1e-9)
@@ -136,7 +136,7 @@ class _Records:
         )
 
     def fuel(self, i: int) -> answers.Fuel | None:
-        """What is burned on a segment, and what is predicted."""
+        """Burned and predicted fuel of a segment."""
         fuel = self._fuel
         if fuel is None or not fuel.share[i]:
             return None
@@ -153,7 +153,7 @@ class _Records:
 
 
 class _Rows:
-    """Rows of a worklist, and changes, by number of their segment. saved_kwh_ph: by each change."""
+    """Rows of a worklist, and changes, by segment number. saved_kwh_ph: by change."""
 
     def __init__(
         self,

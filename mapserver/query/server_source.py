@@ -1,4 +1,4 @@
-"""The map of the process that writes, as queries are answered from it; and the commands, which it alone obeys."""
+"""The writing process as a source of answers; and commands, which only it obeys."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class ServerSource:
         return self._writer.alive()
 
     def origin(self) -> Origin:
-        """The server: a batch is in its map before it is acknowledged."""
+        """The server: a batch is in its map before its acknowledgement."""
         return SERVER
 
     def count(self, what: str) -> None:
@@ -60,13 +60,13 @@ class ServerSource:
 
 
 class CommandDesk:
-    """Carries out commands. info: all that an answer of `info` has."""
+    """Carries out commands. info: as an answer of `info`."""
 
     def __init__(self, writer: Writer, upkeep: Upkeep, info: Callable[[], Mapping[str, Any]]) -> None:
         self._writer, self._upkeep, self._info = writer, upkeep, info
 
     def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
-        """Parse and carry out one command; QueryError says what is wrong with it."""
+        """Parse and carry out a command; QueryError if it is wrong."""
         command = parse_command(name, parameters)
         return command.encode(self._obeyed(command))
 
@@ -81,13 +81,13 @@ class CommandDesk:
                 return self._trust(command)
 
     def _trust(self, command: TrustCommand) -> dict[str, Any]:
-        """What is known of the machine once the command counts, and the version of the map that it counts in."""
+        """The machine's state once the command counts, with the map's version."""
         row = self._upkeep.trust(command.machine, command.trusted, command.reason, command.wait_s)
         version = self._writer.run(lambda store: store.version)
         return {**row, "store": version.store, "merged": version.row, "fact": version.fact}
 
     def _calibrate(self, command: CalibrateCommand) -> CalibrationAnswer:
-        """What is known of all machines once the command counts."""
+        """All machines' calibration once the command counts."""
         if command.machine:
             self._upkeep.correct(command)
         else:

@@ -1,4 +1,4 @@
-"""What queries are answered from: the same small protocol for the process that writes and for one that follows."""
+"""Sources of answers: one protocol for the writing process and for followers."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ T = TypeVar("T")
 
 
 class MapState(Protocol):
-    """A map as it is: nothing changes it while somebody has it."""
+    """A map, constant while in use."""
 
     @property
     def site(self) -> SiteConfig:
-        """Whose map it is."""
+        """Its site."""
 
     @property
     def config(self) -> ServerConfig:
@@ -36,22 +36,22 @@ class MapState(Protocol):
 
     @property
     def facts(self) -> Facts:
-        """What it is folded with."""
+        """Its facts."""
 
     @property
     def version(self) -> MapVersion:
-        """The version that it is."""
+        """Its version."""
 
     @property
     def newest_ns(self) -> int:
-        """The site's now: the newest stamp of the machines that are in it, 0 for none."""
+        """The site's now: newest stamp of machines in the map, 0 for none."""
 
     def machines(self) -> Collection[str]:
-        """Names of all machines that have sent anything."""
+        """Names of machines that have sent samples."""
 
 
 class MapSource(Protocol):
-    """Whoever has the map of a site; for any thread. Each call may raise QueryError. waits: who waits for a row."""
+    """A source of a site's map; thread-safe. Each call may raise QueryError. waits: for journal rows."""
 
     site: SiteConfig
     config: ServerConfig
@@ -59,32 +59,32 @@ class MapSource(Protocol):
 
     @property
     def location(self) -> JournalLocation:
-        """Where the journal is."""
+        """Location of the journal."""
 
     @property
     def past(self) -> StorePast:
-        """What maps of the past are read from."""
+        """Sources of past maps."""
 
     def run(self, work: Callable[[MapState], T]) -> T:
-        """Have `work` done with the map as it is; it has to be short."""
+        """Run short `work` on the present map."""
 
     def changes(self, after: int) -> list[GroundChange]:
-        """Changes of the ground with a number beyond `after`."""
+        """Changes numbered above `after`."""
 
     def machines(self) -> list[dict[str, Any]]:
         """State of every machine, as plain values."""
 
     def calibration(self) -> CalibrationAnswer:
-        """What is taken off the samples of all machines."""
+        """Corrections of all machines."""
 
     def info(self) -> dict[str, Any]:
-        """State of the map and of its process, as plain values."""
+        """State of map and process, as plain values."""
 
     def alive(self) -> ServerAlive:
-        """Whether the process does its work, without waiting for anything."""
+        """Whether the process works, without waiting."""
 
     def origin(self) -> Origin:
         """Who answers, and how far behind the journal."""
 
     def count(self, what: str) -> None:
-        """Count what became of a query, for `info`."""
+        """Count a query's outcome, for `info`."""

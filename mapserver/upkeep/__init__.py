@@ -1,1 +1,1 @@
-"""Jobs that follow the journal and the grid beside the writer: audit, exclusion, changes, archiving."""
+"""Background jobs beside the writer: audit, exclusion, changes, archiving."""

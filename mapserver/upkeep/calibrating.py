@@ -1,8 +1,7 @@
-"""The job that calibrates machines: follows the samples, solves now and then in site time, and has the result decided.
+"""The job that calibrates machines: follows samples, solves at intervals of site time, and hands on results.
 
-What it remembers are the ledgers of the machines. A server that starts makes them anew, from the journal and archive of
-the last days. The site's now is that of what machines sent lately (`SiteClock`): a clock that is wrong counts while it
-is wrong, and not a day longer.
+It keeps the machines' ledgers, rebuilt on start from the last days of journal and archive. The site's now comes from
+recent samples (`SiteClock`): a wrong clock counts only while it is wrong.
 """
 
 from __future__ import annotations
@@ -27,22 +26,22 @@ from protocol.errors import StoreError
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 from protocol.units import DAY_NS
 
-SPAN_NS = 2 * DAY_NS  # of samples, which hold the hours of driving that a ledger remembers of a machine at work
-AHEAD_NS = 600 * 10**9  # of the site's now: machines' clocks, and what is on its way, differ by less
-EVERY_NS = 60 * 10**9  # of site time, between two solves: a fifth of an epoch
-REST = 50.0  # times as long as a run took: 2 % of a core, also where a log is replayed, or a fleet is large
-TURN_SAMPLES = 200_000  # read in one turn, in about 0.2 s
+SPAN_NS = 2 * DAY_NS  # of samples, which hold the driving that a ledger keeps
+AHEAD_NS = 600 * 10**9  # tolerance beyond the site's now, for clocks and delays
+EVERY_NS = 60 * 10**9  # site time between solves, a fifth of an epoch
+REST = 50.0  # pause relative to a run: 2 % of a core, even for replays and large fleets
+TURN_SAMPLES = 200_000  # read per turn, in about 0.2 s
 Decide = Callable[[Solution, int], object]
 Group = tuple[str, ...]
 log = logging.getLogger("mapserver.upkeep.calibrating")
-RECENT = 10  # marks; a machine that was silent for longer says nothing of now, though its clock may have been ahead
+RECENT = 10  # marks; a machine silent for longer says nothing of now
 
 
 class Calibrating:
-    """Ledgers of all machines, and what they come to. solved: the last solve, and the site's now then [ns].
+    """Ledgers of all machines, and their calibration.
 
-    decide: is given each solve and the site's now [ns]. doubtful: machines that are to have no say now. shown: the last
-    corrections whose scale evidence showed.
+    solved: last solve, and its site time [ns]. decide: takes solves with site time [ns]. doubtful: machines without
+    influence. shown: last corrections with a scale from evidence.
     """
 
     name = "calibration"
@@ -62,23 +61,23 @@ class Calibrating:
         self._reader = writer.location.reader()
         self._clock = SiteClock()
         self._ledgers: dict[str, StayLedger] = {}
-        # By machine, from when on there may be samples of it: of one that was here before, not all are read.
+        # earliest possible sample by machine; of machines seen before, not all are read
         self._begins_ns = dict.fromkeys((machine for machine, _ in self._reader.watermarks()), 0)
         self._followed = 0
-        self._passed_over = 0  # rows that could not be read, at the next attempt
-        self._parts: dict[Group, Solution] = {}  # the last solve of each group
-        self._next = -1  # of the groups
-        self._from_ns: int | None = None  # of samples that are read: until it has caught up, those of the last days
+        self._passed_over = 0  # unreadable rows to skip next
+        self._parts: dict[Group, Solution] = {}  # last solve of each group
+        self._next = -1  # index of the last group
+        self._from_ns: int | None = None  # of samples read; until caught up, only the last days
         self._due_s = 0.0
-        self._turn = threading.Lock()  # of all that is used here: `solve` is for any thread
+        self._turn = threading.Lock()  # guards all here: `solve` is thread-safe
 
     def states(self) -> Mapping[str, MachineErrors]:
-        """What the last solve says of machines, by name."""
+        """The last solve's machines, by name."""
         return self.solved[0].machines
 
     def run(self) -> None:
-        """Follow the journal; where that is done and it is time, solve the next group, and have it decided."""
-        if time.monotonic() < self._due_s or not self._turn.acquire(blocking=False):  # as while somebody has it solved
+        """Follow the journal; when up to date and due, solve the next group and hand it on."""
+        if time.monotonic() < self._due_s or not self._turn.acquire(blocking=False):  # busy during a `solve`
             return
         began_s, rest = time.thread_time(), REST
         try:
@@ -91,7 +90,7 @@ class Calibrating:
             self._turn.release()
 
     def solve(self) -> tuple[Solution, int]:
-        """Solve with all that is journalled by now; what came out, and the site's now [ns]. For any thread."""
+        """Solve with all that is journalled now; returns result and site time [ns]. Thread-safe."""
         with self._turn:
             while not self._follow(TURN_SAMPLES) and not self._ending.is_set():
                 pass
@@ -102,12 +101,12 @@ class Calibrating:
             return self.solved
 
     def close(self) -> None:
-        """Close the journal, unless a solve goes on: that ends with the process, and is of no use any more."""
+        """Close the journal, unless a solve is running, which ends with the process."""
         if self._turn.acquire(blocking=False):
-            self._reader.close()  # and keep the turn: nothing runs any more
+            self._reader.close()  # keeps the turn, so that nothing runs any more
 
     def _begun(self) -> tuple[int, list[Group]]:
-        """The site's now, and all groups of machines, without those that left: as after a start."""
+        """Site time, and all groups of machines, as after a start."""
         now_ns = self._clock.now_ns(self._doubtful())
         self._clock.mark()
         self._ledgers = {name: own for name, own in self._ledgers.items() if own.newest_ns >= now_ns - SPAN_NS}
@@ -122,7 +121,7 @@ class Calibrating:
             self._decide(solved, now_ns)
 
     def _solve(self, names: Group, together: Sequence[Group], now_ns: int) -> Solution:
-        """Solve one group of machines; what it says. together: all groups."""
+        """Solve one group. together: all groups."""
         began_s, stays = time.thread_time(), {}
         for name in names:
             self._ledgers[name].until_ns = now_ns + AHEAD_NS
@@ -138,10 +137,9 @@ class Calibrating:
         return solved
 
     def _follow(self, most: int) -> bool:
-        """Take about so many samples into the ledgers; whether all are in that there were.
+        """Add about `most` samples to the ledgers; returns whether all are in.
 
-        Where rows cannot be read, it goes on behind them the next time, as far as it takes: evidence that is missing
-        makes corrections less sure, not wrong.
+        Unreadable rows are skipped, in growing steps: missing evidence makes corrections less certain, not wrong.
         """
         if self._from_ns is None:
             self._from_ns = max(0, self._writer.run(lambda store: store.newest_ns) - SPAN_NS)
@@ -150,7 +148,7 @@ class Calibrating:
         try:
             for rows in self._past.rows(self._reader, Selection(from_ns=self._from_ns), self._followed, until):
                 self._passed_over = 0
-                self._followed = int(rows.numbers[-1])  # first: what fails is not taken twice
+                self._followed = int(rows.numbers[-1])  # first, so that failures are not repeated
                 self._add(rows)
                 taken += len(rows.samples)
                 if taken >= most or self._ending.is_set():
@@ -161,7 +159,7 @@ class Calibrating:
                 "calibration passes over rows=%d after=%d error=%r", self._passed_over, self._followed, str(error)
             )
             return False
-        self._followed, self._from_ns, self._passed_over = until, 0, 0  # what is late from now on is of interest
+        self._followed, self._from_ns, self._passed_over = until, 0, 0  # late samples matter from here on
         return True
 
     def _add(self, rows: JournalRows) -> None:
@@ -183,11 +181,11 @@ class Calibrating:
                 self._share_room()
             self._ledgers[name].until_ns = until_ns
             self._ledgers[name].add(own)
-        if self._from_ns:  # what was known before the start is decided already
+        if self._from_ns:  # earlier data is already decided
             self._clock.mark()
 
     def _share_room(self) -> None:
-        """Have each ledger remember what a solve of so many machines takes, and no more."""
+        """Set the number of epochs that each ledger keeps to what a solve takes."""
         epochs = epochs_of_each(len(self._ledgers))
         if any(ledger.epochs != epochs for ledger in self._ledgers.values()):
             log.info("calibration machines=%d epochs=%d: so many of each are remembered", len(self._ledgers), epochs)
@@ -196,34 +194,34 @@ class Calibrating:
 
 
 class SiteClock:
-    """Site time for a job that looks now and then, which is marked each time.
+    """Site time for a periodic job, which marks each run.
 
-    A machine is as far as what came in of it last, so that it falls back with the machine's clock.
+    A machine's time is that of its last received sample, so it falls back with its clock.
     """
 
     def __init__(self) -> None:
         self._marks = 0
-        self._last_ns: dict[str, int] = {}  # by machine, of what came in last
-        self._since: dict[str, int] = {}  # by machine, behind which mark that came in
-        self._marked_ns: dict[str, int] = {}  # by machine, its last at the last mark, or its first stamp of all
+        self._last_ns: dict[str, int] = {}  # by machine: last received stamp
+        self._since: dict[str, int] = {}  # by machine: the mark before it
+        self._marked_ns: dict[str, int] = {}  # by machine: last stamp at the last mark, or its first
 
     def add(self, machine: str, oldest_ns: int, last_ns: int) -> None:
-        """Take samples of a machine into account, by the oldest stamp and that of what came in last."""
+        """Note samples, by oldest and last received stamp."""
         self._marked_ns.setdefault(machine, oldest_ns)
         self._last_ns[machine], self._since[machine] = last_ns, self._marks
 
     def now_ns(self, without: Collection[str] = ()) -> int:
-        """The newest stamp of all machines but some [ns], of those that sent anything of late; 0 for none."""
+        """Newest stamp [ns] of recently active machines, except some; 0 for none."""
         since = {name: mark for name, mark in self._since.items() if name not in without} or self._since
         last = max(since.values(), default=0)
         return max((self._last_ns[name] for name, mark in since.items() if mark > last - RECENT), default=0)
 
     def passed_ns(self, without: Collection[str] = ()) -> int:
-        """Site time since the last mark [ns], by the machine that went on furthest, or was set back."""
+        """Site time since the last mark [ns]: the largest step of any machine, either way."""
         names = (name for name, mark in self._since.items() if mark == self._marks and name not in without)
         return max((abs(self._last_ns[name] - self._marked_ns[name]) for name in names), default=0)
 
     def mark(self) -> None:
-        """Begin to count anew what has passed."""
+        """Restart the count."""
         self._marked_ns |= self._last_ns
         self._marks += 1

@@ -1,4 +1,4 @@
-"""The job that makes checkpoints of the evidence, a piece in every turn, and removes those that are not needed."""
+"""The job that makes checkpoints, a piece per turn, and removes unneeded ones."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from mapserver.past.plan import due, surplus, thinned
 from mapserver.upkeep.jobs import PIECE_S
 from protocol.units import MINUTE_NS
 
-LATE_ROWS = 5000  # so many that came in late are read for a map of the past, in 50 ms, before they are folded in
-RESERVE_BYTES = 2**30  # of the disk: what machines send goes before
+LATE_ROWS = 5000  # late rows after which a checkpoint is rebuilt; reading them takes 50 ms
+RESERVE_BYTES = 2**30  # of the disk, kept for samples
 LATER_S = 60.0  # after damage, or without room
 log = logging.getLogger("mapserver.upkeep.checkpointing")
 
 
 @dataclass(frozen=True)
 class _Making:
-    """A checkpoint in the making. began_s: on the monotonic clock."""
+    """An unfinished checkpoint. began_s: monotonic."""
 
     path: Path
     closed_ns: int
@@ -39,7 +39,7 @@ class _Making:
 
 
 class Checkpointing:
-    """Makes checkpoints, again where one cannot be used or lacks much that came in late, and keeps within limits."""
+    """Makes checkpoints, replaces unusable or outdated ones, and limits their size."""
 
     name = "checkpoints"
 
@@ -47,25 +47,25 @@ class Checkpointing:
         self._writer, self._reader, self._past, self._ending = writer, reader, past, ending
         self._limit_bytes = round(writer.config.store.checkpoints_gb * 1e9)
         self._making: _Making | None = None
-        self._expected_bytes = 0  # of the next one: as many as the last one had
-        self._nothing_due: object = None  # what there was when nothing was
+        self._expected_bytes = 0  # of the next one, as of the last
+        self._nothing_due: object = None  # state in which nothing was due
         self._looked = 0
         self._due_s = 0.0
         remove_unfinished(past.checkpoints)
 
     def run(self) -> None:
-        """Go on with the one in the making, or begin with one that is due."""
+        """Continue the unfinished checkpoint, or start a due one."""
         if time.monotonic() < self._due_s:
             return
         try:
             self._turn()
-        except Exception:  # for the upkeep to log; whatever it is, it is not tried again at once
+        except Exception:  # logged by the upkeep; retried later
             self.close()
             self._due_s = time.monotonic() + LATER_S
             raise
 
     def close(self) -> None:
-        """Give up the one in the making."""
+        """Cancel the unfinished checkpoint."""
         if self._making:
             self._making.steps.close()  # type: ignore[attr-defined]
             self._making = None
@@ -97,7 +97,7 @@ class Checkpointing:
         log.info("checkpoint made name=%s bytes=%d seconds=%.1f", *values)
 
     def _next(self, now_ns: int, facts: Facts, entries: list[Entry]) -> int | None:
-        """When the next one is closed; None where there is nothing to do."""
+        """Closing time of the next one, or None."""
         usable, unusable = ([entry.closed_ns for entry in entries if entry.usable == each] for each in (True, False))
         there = (now_ns // MINUTE_NS, facts, *usable, None, *unusable)
         if there != self._nothing_due:
@@ -108,7 +108,7 @@ class Checkpointing:
         return self._overtaken([entry for entry in entries if entry.usable])
 
     def _overtaken(self, usable: list[Entry]) -> int | None:
-        """Look whether one of those that there are, another in each turn, lacks so much that it is to be made again."""
+        """A checkpoint that lacks many late rows; checks another one each turn."""
         self._looked += 1
         for entry in usable[self._looked % max(1, len(usable)) :][:1]:
             if entry.header and self._past.late_rows(self._reader, entry.header) >= LATE_ROWS:
@@ -116,7 +116,7 @@ class Checkpointing:
         return None
 
     def _has_room(self, now_ns: int, entries: list[Entry], more: int) -> bool:
-        """Make room for so many bytes, within the limit and what the disk has to spare; whether there is."""
+        """Make room for more bytes, within limit and disk space; returns whether there is."""
         there = sum(entry.bytes for entry in entries)
         spare = shutil.disk_usage(self._writer.location.folder).free - RESERVE_BYTES
         most = min(self._limit_bytes, there + spare) - more

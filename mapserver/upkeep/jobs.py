@@ -1,7 +1,4 @@
-"""Jobs of the upkeep that look again and again: audit of machines, search for changes, archiving of old rows.
-
-Each has a name for the log, and a `run` that does what is due and returns soon.
-"""
+"""Periodic jobs of the upkeep: audit of machines, search for changes, archiving."""
 
 from __future__ import annotations
 
@@ -31,13 +28,13 @@ from mapserver.journal.journal import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
 from protocol.queries.answers import GroundChange
 
-PIECE_S = 0.3  # of a turn, while other jobs wait: with ten machines, an hour's checkpoint takes a second in all
-LOOK_BLOCKS = 256  # for changes, at a time: the writer copies their pages, and batches wait meanwhile
-# A block is looked at once nobody has driven on it for so many turns, or every so many: a pass folds into it again and
-# again, and each time all of its evidence would be compared.
+PIECE_S = 0.3  # per turn, while others wait; ten machines' hourly checkpoint takes a second in all
+LOOK_BLOCKS = 256  # per look for changes; batches wait while the writer copies their pages
+# A block is examined after so many turns without traffic, or at most so many: each pass changes it again, and each look
+# compares all of its evidence.
 REST_TURNS, MOST_TURNS = 3, 20
-LOOK_S = 60.0  # between two looks for rows that are old enough: files are of whole hours
-KEEP_S = 3600.0  # between two looks for decisions, where no file is new
+LOOK_S = 60.0  # between looks for rows to archive, as files are hourly
+KEEP_S = 3600.0  # between looks for decisions, without new files
 Report = Callable[[Mapping[str, Verdict], int], None]
 Known = Callable[[], tuple[SampleCorrections, Mapping[str, MachineErrors]]]
 Publish = Callable[[GroundChange], None]
@@ -45,7 +42,7 @@ log = logging.getLogger("mapserver.upkeep.jobs")
 
 
 class Job(Protocol):
-    """Work that is looked after again and again. name: for the log."""
+    """Periodic work. name: for the log."""
 
     name: str
 
@@ -54,10 +51,10 @@ class Job(Protocol):
 
 
 class Audit:
-    """Hands what is journalled, corrected, to an auditor, and judges all machines from time to time.
+    """Feeds journalled, corrected samples to an auditor, and judges machines periodically.
 
-    report: is given all verdicts, and the site's now [ns]. known: the corrections that are decided, also of machines
-    that are left out, and what calibration knows of machines, by name.
+    report: takes verdicts and site time [ns]. known: decided corrections, also of excluded machines, and calibration by
+    machine.
     """
 
     name = "audit"
@@ -73,22 +70,22 @@ class Audit:
         self._due_s = 0.0
 
     def _begin(self) -> None:
-        """Begin anew, with the first row that is not archived."""
+        """Restart with the first unarchived row."""
         self._auditor = Auditor(self._writer.site.cell_m, self._writer.config.fold)
         self._followed = self._reader.archived_row
 
     def run(self) -> None:
-        """Follow the journal, then judge where it is time."""
+        """Follow the journal; judge if due."""
         try:
             self._follow()
-        finally:  # a row that cannot be read must not keep the machines from being judged by the others
+        finally:  # an unreadable row must not stop judging
             if time.monotonic() >= self._due_s:
                 self._due_s = time.monotonic() + self._writer.config.trust.judge_s
                 self._judging = self._judging or self._auditor.judging(self._known()[1])
             self._judge()
 
     def _judge(self) -> None:
-        """Go on with judging for a while: pairs of a large fleet take minutes."""
+        """Judge for a limited time: pairs of a large fleet take minutes."""
         until_s, judging, self._judging = time.thread_time() + PIECE_S, self._judging, None
         for verdicts in judging or ():
             if verdicts is not None:
@@ -100,10 +97,10 @@ class Audit:
 
     def _follow(self) -> None:
         corrections, _ = self._known()
-        if corrections != self._corrections:  # a map of a machine is of samples that were all corrected alike
+        if corrections != self._corrections:  # a machine's map needs the same corrections throughout
             self._corrections = corrections
             self._begin()
-        until = self._reader.last_row  # what comes in meanwhile waits for the next turn: a busy site has no end
+        until = self._reader.last_row  # later rows wait for the next turn, or a busy site has no end
         for rows in self._reader.read_many(after=max(self._followed, self._reader.archived_row), until=until):
             samples = corrections.applied(rows.samples, rows.machines, np.repeat(rows.machine, rows.lengths))
             self._auditor.add_all(replace(rows, samples=samples))
@@ -113,7 +110,7 @@ class Audit:
 
 
 class ChangeSearch:
-    """Looks at what was folded since the last look. publish: is given each change when it is new or grows."""
+    """Examines what was folded since. publish: takes new and extended changes."""
 
     name = "changes"
 
@@ -125,15 +122,15 @@ class ChangeSearch:
         self._log = ChangeLog(cell_m, config.change, config.read, kept)
         self._lock = threading.Lock()
         self._turn, self._touched = 0, dict[Block, tuple[int, int]]()  # first and last turn since the last look
-        writer.run(lambda store: store.grid.touch_all())  # the log knows the changes, but not yet their cells
+        writer.run(lambda store: store.grid.touch_all())  # the log knows changes, but not their cells
 
     def changes(self, after: int) -> list[GroundChange]:
-        """Changes with a number beyond `after`; for any thread."""
+        """Changes numbered above `after`; thread-safe."""
         with self._lock:
             return self._log.changes(after)
 
     def run(self) -> None:
-        """Look at blocks that were folded into, where it is time; keep and publish each change."""
+        """Examine due blocks; store and publish changes."""
         self._turn += 1
         for block in self._writer.run(lambda store: store.grid.take_touched(sys.maxsize)):
             self._touched[block] = self._touched.get(block, (self._turn, 0))[0], self._turn
@@ -161,15 +158,15 @@ class ChangeSearch:
         self._writer.run(lambda store: store.journal.append_event(change_log.KIND, change.last_ns, asdict(change)))
 
     def _pages(self, blocks: list[Block]) -> dict[Block, TimedPages]:
-        """Pages of those blocks that have any."""
+        """Pages of blocks that have any."""
         pages = self._writer.run(lambda store: store.grid.pages(blocks))
         return {block: some for block, some in zip(blocks, pages, strict=True) if some}
 
 
 class Archiving:
-    """Moves journal rows that are old enough into hourly Parquet files, and keeps decisions beside these.
+    """Moves old journal rows into hourly Parquet files, and stores decisions beside them.
 
-    Those of a shared journal stay where all servers find them: files in the folder of one would be gone with its host.
+    Shared journals are not archived, because files in one server's folder would be lost with its host.
     """
 
     name = "archiving"
@@ -177,10 +174,10 @@ class Archiving:
     def __init__(self, writer: Writer, reader: JournalReader, ending: threading.Event) -> None:
         self._writer, self._reader, self._ending = writer, reader, ending
         self._due_s = 0.0
-        self._kept, self._keep_s = 0, 0.0  # number of the last decision that is beside the files; next time to look
+        self._kept, self._keep_s = 0, 0.0  # last decision stored beside the files; next time to look
 
     def run(self) -> None:
-        """Move the next hour of old rows, where it is time: an hour a turn, so that the end need not wait."""
+        """Move the next due hour; one per turn, for a quick shutdown."""
         after_h = self._writer.config.store.archive_after_h
         if not after_h or self._writer.location.is_shared or time.monotonic() < self._due_s:
             return
@@ -191,14 +188,14 @@ class Archiving:
         if path := next(hours, None):
             self._writer.run(lambda store: store.journal.shrink())
             log.info("archived file=%s", path.name)
-            self._due_s = 0.0  # there may be more hours
+            self._due_s = 0.0  # maybe more hours
         if path or time.monotonic() >= self._keep_s:
             self._keep_decisions(folder)
 
     def _keep_decisions(self, folder: Path) -> None:
-        """Have those about calibration beside the files, where there are any.
+        """Store calibration decisions beside files, if there are any.
 
-        All are written again each time: those about archived hours, which are of use there, seldom change.
+        All are rewritten; those of archived hours rarely change.
         """
         self._keep_s = time.monotonic() + KEEP_S
         newest = self._writer.run(lambda store: store.fact)
@@ -207,6 +204,6 @@ class Archiving:
             self._kept = newest
 
     def _forget(self, until: int) -> int:
-        if self._ending.is_set():  # what is in both meanwhile counts once, and the next start goes on with it
+        if self._ending.is_set():  # rows in both count once, and the next start continues
             return until
         return self._writer.run(lambda store: store.journal.forget(until))

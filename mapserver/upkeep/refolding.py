@@ -1,7 +1,7 @@
-"""Decisions about machines: kept with the journal, then the map is folded again with the facts that they come to.
+"""Decisions about machines: stored in the journal, then the map is rebuilt with the resulting facts.
 
-The grid belongs to the writer's thread. So a map with other facts is folded on a thread of its own (`fold_anew`); the
-writer folds what that left, a few rows, and goes on with it.
+The writer's thread owns the grid, so the new map is folded on another thread (`fold_anew`); the writer folds the few
+remaining rows and swaps.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError
 
-RETRY_S, MOST_RETRY_S = 1.0, 60.0  # after rows that could not be read; doubled, as a fold up to them may take minutes
+RETRY_S, MOST_RETRY_S = 1.0, 60.0  # after unreadable rows; doubles, because a fold up to them may take minutes
 T = TypeVar("T")
 log = logging.getLogger("mapserver.upkeep.refolding")
 
 
 class Refolding:
-    """Decisions about machines, and a thread that folds the map as they say. All of it is for any thread."""
+    """Decisions about machines, and the thread that rebuilds the map. Thread-safe."""
 
     def __init__(self, writer: Writer, past: StorePast) -> None:
         self._writer, self._past = writer, past
@@ -41,72 +41,72 @@ class Refolding:
         self._decisions = Decisions.of_journal(self._reader)
         self._wanted = self._decisions.facts
         self._changed = threading.Condition()  # its holder never waits for the writer, which takes it
-        self._decided = self._folded = 0  # decisions kept since the start, and so many of them that the map follows
-        self._gave_up = False  # the last fold, for another one
+        self._decided = self._folded = 0  # decisions stored since the start, and those in the map
+        self._gave_up = False  # the last fold, for another
         self._problem = ""  # of the last fold, until one succeeds
         self._ending = False
         self._thread = threading.Thread(target=self._run, name="refold", daemon=True)
         self._thread.start()
 
     def facts(self) -> Facts:
-        """What the map is folded with."""
+        """The map's facts."""
         return self._writer.run(lambda store: store.facts)
 
     def distrusted(self) -> frozenset[str]:
-        """Machines that decisions leave out, though they may be in the map still."""
+        """Machines excluded by decisions, possibly still in the map."""
         with self._changed:
             return self._decisions.trust.distrusted
 
     def decision(self, machine: str) -> TrustDecision | None:
-        """The newest decision about the trust in a machine that counts."""
+        """The newest trust decision about a machine."""
         with self._changed:
             return self._decisions.trust.newest(machine)
 
     def corrections(self) -> SampleCorrections:
-        """Those that decisions come to, also of machines that are left out."""
+        """Decided corrections, also of excluded machines."""
         with self._changed:
             return self._decisions.calibration.corrections
 
     def solver_corrections(self) -> list[Correction]:
-        """The newest of each machine that the solver decided."""
+        """Newest correction of each machine by the solver."""
         with self._changed:
             return self._decisions.calibration.of_solver()
 
     def shown(self) -> list[Correction]:
-        """The last of each machine whose scale evidence showed."""
+        """Last correction of each machine with a scale from evidence."""
         with self._changed:
             return self._decisions.calibration.shown()
 
     def calibration(self, machine: str) -> CalibrationDecision | None:
-        """The newest decision about the calibration of a machine that counts."""
+        """The newest calibration decision about a machine."""
         with self._changed:
             return self._decisions.calibration.newest(machine)
 
     def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
-        """Decide what the audit may decide, which may be nothing: `machines` names its verdicts in any case.
+        """Store the audit's decisions, if exclusion is on.
 
-        Raises QueryError as `decide` does; the audit then decides the same the next time.
+        QueryError as `decide`; the audit then repeats its decision.
         """
         if self._writer.config.trust.exclude:
             write(self._writer, lambda store: self._judge(store, verdicts, stamp_ns))
 
     def calibrate(self, solved: Solution, stamp_ns: int, *, asked: bool = False) -> int:
-        """Decide what the solver may decide, or all that it would where a person asks; returns a number to wait for.
+        """Store the solver's decisions, or all that a person asks for; returns a number to wait for.
 
-        While the map does not follow what is decided, what the solver wants waits: folds of a large site take longer.
-        Raises QueryError as `decide` does; the solver then decides the same the next time.
+        The solver waits while the map lags behind decisions. QueryError as `decide`; the solver then repeats its
+        decision.
         """
         return write(self._writer, lambda store: self._calibrate(store, solved, stamp_ns, asked=asked))
 
     def decide(self, decision: Decision) -> int:
-        """Keep a decision on disk, then have the map folded so; returns its number, to wait for.
+        """Store a decision and have the map rebuilt; returns its number, to wait for.
 
-        Raises QueryError where it cannot be written: nothing has changed then, unless it says that this is not known.
+        QueryError if it cannot be written: nothing changes, unless the error says that this is unknown.
         """
         return write(self._writer, lambda store: self._keep(store, [decision]))
 
     def wait(self, number: int, wait_s: float) -> None:
-        """Wait until a decision, which is kept, counts in the map; QueryError after wait_s."""
+        """Wait until a stored decision is in the map; QueryError after wait_s."""
         with self._changed:
             self._changed.wait_for(lambda: self._folded >= number or self._ending, wait_s)
             if self._folded >= number:
@@ -116,7 +116,7 @@ class Refolding:
         raise QueryError(Refusal.AFTER_TIMEOUT, f"{problem}; ask for `machines`")
 
     def close(self) -> None:
-        """End the thread; a fold is given up, and the next start makes it."""
+        """End the thread; the next start repeats a cancelled fold."""
         with self._changed:
             self._ending = True
             self._changed.notify_all()
@@ -136,7 +136,7 @@ class Refolding:
         return self._keep(store, () if waits else decisions)
 
     def _keep(self, store: Store, decisions: Sequence[Decision]) -> int:
-        """Keep decisions; returns how many there are by now, since the start."""
+        """Store decisions; returns their number since the start."""
         facts = store.decide(*decisions) if decisions else None
         for decision in decisions:
             _log(decision)
@@ -149,7 +149,7 @@ class Refolding:
             return self._decided
 
     def _run(self) -> None:
-        """Have the map follow the decisions; those that were made in the meantime are followed together."""
+        """Rebuild the map after decisions; those made meanwhile are combined."""
         retry_s = RETRY_S
         while decided := self._next():
             number, facts = decided
@@ -163,30 +163,30 @@ class Refolding:
             retry_s = self._pause(number, retry_s) if problem else RETRY_S
 
     def _next(self) -> tuple[int, Facts] | None:
-        """Wait for decisions that the map does not follow yet: how many there are, and what they come to."""
+        """Wait for pending decisions: their number and facts."""
         with self._changed:
             self._changed.wait_for(lambda: self._ending or self._folded < self._decided)
             return None if self._ending else (self._decided, self._wanted)
 
     def _pause(self, number: int, retry_s: float) -> float:
-        """Wait after a fold that failed, unless something else is decided; returns how long the next time."""
+        """Wait after a failed fold, or until another decision; returns the next pause."""
         with self._changed:
             self._changed.wait_for(lambda: self._ending or self._decided > number, retry_s)
         return min(2 * retry_s, MOST_RETRY_S)
 
     def _attempt(self, facts: Facts) -> tuple[bool, str]:
-        """Whether the map follows, and what keeps it from that."""
+        """Whether the map follows, and the problem if not."""
         try:
             return self._follow(facts), ""
         except (SitegridError, OSError) as error:
             log.error("upkeep failed job=refolding error=%r", str(error))
             return False, str(error)
-        except Exception:  # a bug here must not end the server, nor pass unseen
+        except Exception:  # a bug must neither end the server nor go unnoticed
             log.exception("upkeep failed job=refolding")
             return False, "the server failed; see its log"
 
     def _follow(self, facts: Facts) -> bool:
-        """Have a map with these facts; whether it is there, else it is to be another one meanwhile."""
+        """Rebuild the map with these facts; False if superseded."""
         if facts == self.facts():
             return True
         began_s = time.monotonic()
@@ -200,28 +200,28 @@ class Refolding:
             store.adopt(folded.grid, folded.row, facts)
 
         self._writer.run(adopt)
-        replaced.clear()  # here: to let go of a grid takes time that the writer's thread does not have
+        replaced.clear()  # here, because freeing a grid would delay the writer
         release_memory()
         values = (facts.number, ",".join(sorted(facts.excluded)), folded.rounds, time.monotonic() - began_s)
         log.warning("map folded again fact=%d without=%s rounds=%d seconds=%.1f", *values)
         return True
 
     def _superseded(self, facts: Facts) -> bool:
-        """Whether a fold is to be given up, since other facts are wanted meanwhile.
+        """Whether other facts have superseded this fold.
 
-        Never two in a row: where decisions come faster than folds, the map would not follow for ever.
+        Never two in a row, or frequent decisions would starve the map.
         """
         return self._ending or (self._wanted != facts and not self._gave_up)
 
 
 def write(writer: Writer, work: Callable[[Store], T]) -> T:
-    """Have a decision kept on the writer's thread, one at a time: what is in memory is what is on disk, in its order.
+    """Store a decision on the writer's thread, one at a time, so memory and disk have the same order.
 
-    Raises QueryError as `Refolding.decide` does.
+    QueryError as `Refolding.decide`.
     """
     try:
         return writer.run(work)
-    except TimeoutError:  # an OSError, but the work still waits
+    except TimeoutError:  # an OSError, but the work is still queued
         problem = "the server has not written the decision yet, and may still do so; ask for `machines`"
         raise QueryError(Refusal.AFTER_TIMEOUT, problem) from None
     except FencedError as error:

@@ -1,4 +1,4 @@
-"""The job that has snapshots written: often enough that a restart is quick, seldom enough that they cost little."""
+"""The job that writes snapshots: often enough for quick restarts, rarely enough to be cheap."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from collections.abc import Callable
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 
-RESTART_SAMPLES = 500_000  # more than so many that a restart would have to fold, about a second, bring one forward
-SHARE = 0.05  # of the time that is spent on snapshots at most
+RESTART_SAMPLES = 500_000  # samples, about a second of a restart, that trigger an early snapshot
+SHARE = 0.05  # of the time, at most
 
 
 class Snapshots:
-    """Has the writer take a snapshot, where one is due, and writes it."""
+    """Writes due snapshots, taken by the writer."""
 
     name = "snapshots"
 
     def __init__(self, writer: Writer, clock: Callable[[], float] = time.monotonic) -> None:
-        """clock: steady, in seconds."""
+        """clock: monotonic [s]."""
         self._writer, self._clock, self._every_s = writer, clock, writer.config.store.snapshot_s
         self._began_s = self._earliest_s = clock()
 
     def run(self) -> None:
-        """Write one where it is time. What keeps one from the disk, an OSError, will not go at once."""
+        """Write one if due. After an OSError it is not retried at once."""
         began_s = self._clock()
         samples = self._writer.run(lambda store: store.samples_behind)
         wait_s = 0.0 if samples >= RESTART_SAMPLES else self._every_s

@@ -1,4 +1,4 @@
-"""The upkeep: a thread beside the writer that runs six jobs in turn, and one that folds the map again."""
+"""The upkeep: a thread beside the writer with six jobs in turn, and one that rebuilds the map."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ from protocol.queries.answers import GroundChange
 from protocol.queries.calibration import CalibrationAnswer
 from protocol.queries.commands import CalibrateCommand
 
-# Between two turns: where a large fleet drives everywhere each has much to look at, and no more than a share of one
-# core should go into that.
+# Pause between turns, longer after much work, to limit the share of a core.
 TURN_S, LATEST_S = 1.0, 5.0
 SHARE = 0.2
 END_S = 5.0
@@ -33,10 +32,7 @@ log = logging.getLogger("mapserver.upkeep.upkeep")
 
 
 class Upkeep:
-    """Machines and changes of one site. All but the thread itself is for any thread.
-
-    publish: is given each change when it is new or grows.
-    """
+    """Machines and changes of one site. Thread-safe. publish: takes new and extended changes."""
 
     def __init__(self, writer: Writer, publish: Publish, past: StorePast) -> None:
         self._writer = writer
@@ -62,7 +58,7 @@ class Upkeep:
         self._thread.start()
 
     def changes(self, after: int = 0) -> list[GroundChange]:
-        """Changes of the ground with a number beyond `after`."""
+        """Changes numbered above `after`."""
         return self._changes.changes(after)
 
     def machines(self) -> list[dict[str, Any]]:
@@ -71,10 +67,10 @@ class Upkeep:
         return [self._machine(name, sent[name]) for name in sorted(sent)]
 
     def trust(self, machine: str, trusted: bool | None, reason: str, wait_s: float) -> dict[str, Any]:  # noqa: FBT001
-        """Trust a machine or not, None leaves it to the audit; waits until the map is folded so.
+        """Trust a machine or not, or leave it to the audit (None); waits for the map.
 
-        Returns the state of the machine. Raises QueryError for a machine that has sent nothing, where the decision
-        cannot be written, or after wait_s; then it is kept all the same.
+        Returns the machine's state. QueryError for an unknown machine, a failed write, or after wait_s, when the
+        decision still stands.
         """
         self._require_known(machine)
         number = self._refolding.decide(self._decision(machine, trusted, reason))
@@ -82,7 +78,7 @@ class Upkeep:
         return next(row for row in self.machines() if row["name"] == machine)
 
     def calibration(self) -> CalibrationAnswer:
-        """What is taken off the samples of all machines, and what is known of their calibration."""
+        """Corrections in the map, and calibrations of machines."""
         solved, solved_ns = self._calibrating.solved
         version, corrections, sent = self._writer.run(
             lambda store: (store.version, store.facts.corrections, store.machines())
@@ -95,9 +91,9 @@ class Upkeep:
         return CalibrationAnswer(version.store, version.row, version.fact, *common, tuple(machines))
 
     def correct(self, command: CalibrateCommand) -> None:
-        """Decide what is taken off the samples of one machine, or leave it to the solver; waits as `calibrate`.
+        """Set a machine's corrections, or leave them to the solver; waits as `calibrate`.
 
-        Raises QueryError as that does, and for a machine that has sent nothing.
+        QueryError as there, and for an unknown machine.
         """
         self._require_known(command.machine)
         stamp_ns = self._writer.run(lambda store: store.newest_ns)
@@ -105,9 +101,9 @@ class Upkeep:
         self._refolding.wait(number, command.wait_s)
 
     def calibrate(self, wait_s: float) -> None:
-        """Calibrate all machines with all that is journalled by now; waits until the map is folded so.
+        """Calibrate all machines with all that is journalled; waits for the map.
 
-        Raises QueryError where nothing can be read or written, or after wait_s; then what was decided is kept.
+        QueryError if reading or writing fails, or after wait_s, when decisions still stand.
         """
         try:
             solved, now_ns = self._calibrating.solve()
@@ -119,7 +115,7 @@ class Upkeep:
         self._refolding.wait(number, wait_s)
 
     def close(self) -> None:
-        """End the threads; what takes longer than END_S, as a solve may, ends with the process."""
+        """End the threads; a solve that exceeds END_S ends with the process."""
         self._ending.set()
         self._refolding.close()
         self._thread.join(END_S)
@@ -129,9 +125,9 @@ class Upkeep:
             self._reader.close()
 
     def _known(self) -> tuple[SampleCorrections, Mapping[str, MachineErrors]]:
-        """Corrections that are decided, and what is known of machines: by the last solve, else by an earlier one.
+        """Decided corrections, and machines' errors by the last solve, or an earlier one.
 
-        What a person takes off was not measured, and says nothing of what is broken.
+        A person's corrections are not measured, and prove no fault.
         """
         earlier = {one.machine: state_of(one) for one in self._refolding.solver_corrections()}
         return self._refolding.corrections(), earlier | dict(self._calibrating.states())
@@ -143,7 +139,7 @@ class Upkeep:
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing; known: {names}")
 
     def _doubtful(self) -> frozenset[str]:
-        """Machines without a say on what the ground is like: those left out, and those that contradict all others."""
+        """Machines without influence on the common ground: excluded, or contradicting all others."""
         contradict = {name for name, verdict in self._audit.verdicts.items() if verdict.contradicts}
         return self._refolding.distrusted() | contradict
 
@@ -177,13 +173,13 @@ class Upkeep:
                     break
                 try:
                     job.run()
-                except (SitegridError, OSError) as error:  # the map goes on without; the next turn tries again
+                except (SitegridError, OSError) as error:  # the next turn retries
                     log.error("upkeep failed job=%s error=%r", job.name, str(error))
-                except Exception:  # a bug here must not end the server, nor pass unseen
+                except Exception:  # a bug must neither end the server nor go unnoticed
                     log.exception("upkeep failed job=%s", job.name)
             self._ending.wait(pause_s(time.thread_time() - began_s))
 
 
 def pause_s(worked_s: float) -> float:
-    """How long to wait after a turn that took so much processor time."""
+    """Pause after a turn of this processor time."""
     return min(max(TURN_S, worked_s * (1 / SHARE - 1)), LATEST_S)
