@@ -42,7 +42,7 @@ PLOTTED = ("plotted_wrong_resistance_pct", "plotted_wrong_grade_pct", "plotted_c
 WITH_INTERVAL = ("net_m", *DRIVEN[:2], *PLOTTED[:2])
 DIGITS = 4
 
-DEVIATIONS = {"resistance_std": ("resistance",), "grade_std": ("grade_east", "grade_north")}  # of which layers
+DEVIATIONS = {"resistance_std": ("resistance",), "grade_std": ("grade_east", "grade_north")}  # their layers
 
 
 @dataclass(frozen=True)

@@ -187,7 +187,7 @@ def _of_cells(
     since, later = since_ns.ravel(), passes.begin_ns >= half_ns
     driven = [np.bincount(passes.cell[some], minlength=len(since)) for some in (~later, later)]
     until = later & (passes.end_ns <= since[passes.cell])
-    needed = np.maximum(np.bincount(passes.cell[until], minlength=len(since)), 1)  # a neighbour's evidence may be first
+    needed = np.maximum(np.bincount(passes.cell[until], minlength=len(since)), 1)  # a neighbour's evidence may lead
     first_ns = np.full(len(since), np.iinfo(np.int64).max)
     np.minimum.at(first_ns, passes.cell[later], passes.end_ns[later])
     cells = np.flatnonzero(ground.changed.ravel() & (driven[0] > 0) & (driven[1] > 0))

@@ -169,6 +169,7 @@ def roads(rows: Rows) -> SegmentTable:
 
 
 def tally_of(rows: Rows) -> Tally:
+    """Sum up the traffic."""
     out = Tally()
     for name, table in rows.items():
         out.add(table, np.full(len(table), name_hash(name), np.uint64))
