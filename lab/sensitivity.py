@@ -1,4 +1,4 @@
-"""Which constants matter: each of one stage's Tuning is varied alone, on the same recordings."""
+"""Sensitivity: each constant of a stage's Tuning varied alone, on the same recordings."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from mapserver.calibration.tuning import TUNING as CALIBRATION
 from mapserver.trust.tuning import TUNING as TRUST
 from sitegrid.proof.figures import Report, Row, rounded
 
-BY = 0.3  # of a constant, both ways
+BY = 0.3  # relative variation, both ways
 Tuning = TypeVar("Tuning")
-Variant = tuple[str, float]  # constant, and what it is multiplied by
-FAST = replace(PAPER, world="fast")  # drives are cheap there, and their errors those of sensors alike
+Variant = tuple[str, float]  # constant, factor
+FAST = replace(PAPER, world="fast")  # cheap drives with sensor errors of the usual kind
 AS_IT_IS: Variant = ("", 1.0)
 
 
@@ -33,8 +33,8 @@ AS_IT_IS: Variant = ("", 1.0)
 class Stage:
     """What is varied and judged.
 
-    rows: of all variants one row of figures each. intervals: half-widths of the 95 % intervals of published figures
-    over seeds; of a normalised error, what is no better known.
+    rows: a row of figures per variant. intervals: half-widths of published 95 % intervals over seeds; for normalised
+    errors their own resolution.
     """
 
     tuning: Any
@@ -44,40 +44,40 @@ class Stage:
 
 @dataclass(frozen=True, kw_only=True)
 class VariedGround(GroundConfiguration):
-    """The published row of the ground with one constant varied."""
+    """The published ground row with one constant varied."""
 
     variant: Variant = AS_IT_IS
 
     @property
     def name(self) -> str:
-        """Short and unique."""
+        """Short unique name."""
         return f"{super().name}-{self.variant[0]}-{self.variant[1]:g}"
 
     @property
     def tuning(self) -> EstimationTuning:
-        """With the constant varied."""
+        """Tuning with the constant varied."""
         return varied(ESTIMATION, self.variant)
 
 
 @dataclass(frozen=True, kw_only=True)
 class VariedPositions(Configuration):
-    """A published row of positions with one constant varied."""
+    """A published positions row with one constant varied."""
 
     variant: Variant = AS_IT_IS
 
     @property
     def name(self) -> str:
-        """Short and unique."""
+        """Short unique name."""
         return f"{super().name}-{self.variant[0]}-{self.variant[1]:g}"
 
     @property
     def tuning(self) -> LocalisationTuning:
-        """With the constant varied."""
+        """Tuning with the constant varied."""
         return varied(LOCALISATION, self.variant)
 
 
 def varied(tuning: Tuning, variant: Variant) -> Tuning:
-    """A Tuning with one constant varied; a whole number stays one."""
+    """A Tuning with one constant varied; integers stay integers."""
     constant, factor = variant
     if not constant:
         return tuning
@@ -87,13 +87,13 @@ def varied(tuning: Tuning, variant: Variant) -> Tuning:
 
 
 def variants(tuning: object) -> list[Variant]:
-    """Each constant both ways."""
+    """Every constant both ways."""
     names = [field.name for field in fields(tuning)]  # type: ignore[arg-type]
     return [(name, factor) for name in names for factor in (1 - BY, 1 + BY)]
 
 
 def run(runner: Runner, seeds: Sequence[int], seconds: float, stage: str = "estimation") -> tuple[Report, None]:
-    """Vary all constants of a stage; a row for each: what its figures move by, and which beyond their intervals."""
+    """Vary all constants of a stage; a row per constant: shifts of figures, and those beyond intervals."""
     chosen = STAGES[stage]
     whole, *others = chosen.rows(runner, seeds, seconds, [AS_IT_IS, *variants(chosen.tuning)])
     names = [field.name for field in fields(chosen.tuning)]
@@ -104,7 +104,7 @@ def run(runner: Runner, seeds: Sequence[int], seconds: float, stage: str = "esti
 
 
 def moved(stage: Stage, constant: str, whole: Row, both: tuple[Row, Row]) -> Row:
-    """By how much a constant's two variants move the figures."""
+    """Shifts of figures by a constant's two variants."""
     by = {name: [row[name] - whole[name] for row in both] for name in stage.intervals}
     beyond = [name for name, steps in by.items() if not max(map(abs, steps)) <= stage.intervals[name]]
     value = getattr(stage.tuning, constant)
@@ -124,13 +124,13 @@ def _positions(runner: Runner, seeds: Sequence[int], seconds: float, some: Seque
 
 
 def _calibration(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
-    """The map after calibration of three machines, whose samples are made once."""
+    """Map after calibration of three machines; samples are made once."""
     reports = [calibration.run(runner, seeds, seconds, _cases("machines_3"), varied(CALIBRATION, v))[0] for v in some]
     return [row for report in reports for row in report["rows"] if row["map"] == "after"]
 
 
 def _trust(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
-    """How many machines are excluded: of four sound ones, and where one is bad or has a gain."""
+    """Excluded machines: of four sound ones, with one bad, with one gain."""
     cases = _cases(*EXCLUDED)
     runs = [calibration.run(runner, seeds, seconds, cases, trust=varied(TRUST, variant))[1] for variant in some]
     return [{case.name: sum(len(one.distrusted) for one in by_case[case]) for case in cases} for by_case in runs]

@@ -1,7 +1,7 @@
-"""What a number of machines needs, as sums of what was measured of one: `python -m lab.sums`.
+"""Needs of a fleet, extrapolated from one machine: `python -m lab.sums`.
 
-It prints the tables of lab/results/sums.md, in Markdown. Measured figures stand on lab/results/speed.md and
-calibration.md; assumed ones are nobody's: put in your own.
+Prints the Markdown tables of lab/results/sums.md. Measured figures: lab/results/speed.md, calibration.md; replace the
+assumed ones by your own.
 """
 
 from __future__ import annotations
@@ -10,47 +10,47 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-# Measured of one machine that drives all the time, and of one server.
-RATE, UP, DOWN = 6.52, 2583.2, 240.7  # samples a second; B/s of its link, up and down
-ARCHIVE, JOURNAL, POSTGRES = 45.0, 121.0, 160.6  # B/sample
-TAKEN, FOLDED = 48_352, 0.70e6  # samples a second that a server takes, and that a core folds
+# Measured on one constantly driving machine, and one server.
+RATE, UP, DOWN = 6.52, 2583.2, 240.7  # samples/s; link up, down [B/s]
+ARCHIVE, JOURNAL, POSTGRES = 45.0, 121.0, 160.6  # [B/sample]
+TAKEN, FOLDED = 48_352, 0.70e6  # samples/s taken by a server, and folded by a core
 ANSWERS_A_CORE = 100 / 0.23  # of followers
-JOURNALS = {"SQLite": 1.0, "PostgreSQL": 0.64, "with a synchronous replica": 0.59}  # speed, of SQLite's
+JOURNALS = {"SQLite": 1.0, "PostgreSQL": 0.64, "with a synchronous replica": 0.59}  # relative throughput
 # Assumed.
-DRIVES, HOURS, DAYS = 0.4, 10, 300  # share of a working day of so many hours, days a year
-HEADROOM, ROUTED = 0.5, 500  # share of what a server takes that a site may need; machines at one router
-HOST, DISK, SIM_CARD, TRAFFIC = 50, 0.10, 5, 1.0  # EUR: a month, a GB and month (kept twice), a month, a GB
+DRIVES, HOURS, DAYS = 0.4, 10, 300  # share of a working day driven, hours a day, days a year
+HEADROOM, ROUTED = 0.5, 500  # usable share of a server's capacity; machines per router
+HOST, DISK, SIM_CARD, TRAFFIC = 50, 0.10, 5, 1.0  # EUR per month, per GB and month (stored twice), per month, per GB
 
 FLEETS, SITES, READERS = (10, 1000, 100_000), (10, 500), (100, 1000, 10_000)
 GB, KBIT, MONTHS = 1e9, 1000 / 8, 12
-TAKE_OVER_HOSTS = 4  # two servers, a database and its replica; a site without take-over has one
+TAKE_OVER_HOSTS = 4  # two servers, a database and its replica; without take-over one
 
 
 @dataclass(frozen=True)
 class Needs:
-    """What all machines need on sites of so many each. A year, where nothing else is said; costs in EUR."""
+    """Needs of all machines by site size, per year; costs in EUR."""
 
     machines: int
     per_site: int
 
     @property
     def sites(self) -> int:
-        """Sites, each with a map server."""
+        """Sites, one map server each."""
         return math.ceil(self.machines / self.per_site)
 
     @property
     def on_site(self) -> int:
-        """Machines of one site."""
+        """Machines per site."""
         return min(self.machines, self.per_site)
 
     @property
     def samples(self) -> float:
-        """Samples of all."""
+        """Samples of all machines."""
         return self.machines * RATE * self.driven_s
 
     @property
     def driven_s(self) -> float:
-        """Seconds that a machine drives."""
+        """Driving time of a machine [s]."""
         return HOURS * 3600 * DAYS * DRIVES
 
     @property
@@ -59,12 +59,12 @@ class Needs:
         return (UP + DOWN) * self.driven_s / GB
 
     def eur(self, hosts: int, disk_gb: float) -> float:
-        """Hosts of each site, disks that fill over the year, and links."""
+        """Cost of hosts, of disks that fill over the year, and of links."""
         links = self.machines * (MONTHS * SIM_CARD + TRAFFIC * self.traffic_gb)
         return hosts * self.sites * MONTHS * HOST + DISK * MONTHS / 2 * disk_gb + links
 
     def lines(self) -> Iterator[tuple[str, str]]:
-        """Of the table of sites: what, and how much."""
+        """Rows of the sites table."""
         archive, postgres = self.samples * ARCHIVE / GB, 2 * self.samples * POSTGRES / GB
         fold_h = self.samples / FOLDED / 3600
         eur, take_over_eur = self.eur(1, archive), self.eur(TAKE_OVER_HOSTS, postgres / 2)
@@ -85,12 +85,12 @@ class Needs:
 
 
 def carried(share: float) -> int:
-    """Machines that all drive at once and are HEADROOM of what one writer takes; share: speed of its journal."""
+    """Constantly driving machines at HEADROOM of one writer; share: its journal's relative speed."""
     return int(HEADROOM * TAKEN * share / RATE)
 
 
 def tables() -> list[str]:
-    """Readers, one writer, and a table for each size of sites."""
+    """Readers, one writer, and a table per site size."""
     readers = [(_number(n), _number(math.ceil(n / ANSWERS_A_CORE))) for n in READERS]
     writers = [(name, _number(TAKEN * share), _number(carried(share))) for name, share in JOURNALS.items()]
     head = ("journal", "one writer takes, samples a second", "machines that all drive are half of that")

@@ -1,1 +1,1 @@
-"""Calibration of machines by each other and by the ground: what it gives the map, and where it must do no harm."""
+"""Calibration of machines by each other and by the ground: benefit to the map, and harmlessness."""

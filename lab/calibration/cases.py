@@ -1,4 +1,4 @@
-"""The cases on which calibration is judged: what is driven, what is wrong with machines or samples, who is let in."""
+"""Cases for calibration: the drive, the faults of machines or samples, forced admissions."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from protocol.arrays import Bools, Floats, Floats32, Table
 
 Rows = Mapping[str, Table]  # samples by machine
 PAPER = "paper_site"
-STEEP = 0.13  # gradient beyond which a cell or a place is on a ramp
+STEEP = 0.13  # gradient beyond which a cell or place is on a ramp
 GAIN, STEP, RAIN, HARDER = 1.6, 0.015, 0.02, 0.25
 RAMP_STEPS = (-0.02, 0.005, 0.01, 0.02)
-PRESETS = ("paper", "harsh", "standalone")  # of sensors, beside `dgps`, which all other cases have
-DIRT = (0.03, 0.05)  # c_rr of the ground that rain makes heavier
+PRESETS = ("paper", "harsh", "standalone")  # sensor presets besides `dgps`, which all other cases use
+DIRT = (0.03, 0.05)  # c_rr of ground that rain makes heavier
 
 
 @dataclass(frozen=True)
 class Tampered:
-    """Samples as a case has them, and the true c_rr (rows, columns) of the cells at the end.
+    """Samples of a case, and the true final c_rr (rows, columns) of cells.
 
-    earlier: what it was for a machine that drove before it changed. passed_by: whose cells are judged, all by default.
+    earlier: the c_rr for a machine that drove before the change. passed_by: machines whose cells are judged, default
+    all.
     """
 
     rows: Rows
@@ -38,11 +39,11 @@ Tamper = Callable[[Rows, Scene], Tampered]
 
 @dataclass(frozen=True)
 class FleetCase:
-    """One case. machines: how many of a drive of the paper's site, or 0 for all of a scenario, take part.
+    """One case. machines: number of participants on the paper's site; 0: all of a scenario.
 
-    preset: of sensors, "" for those of the scenario. bad, let_in: machines by their place that have the faults of
-    `bad_machine`, and that are in the map by a person's decision, whatever trust says. calibrates, closed_tours: what
-    agents do by themselves. spans: in which the true errors are constant. first_s: so much of the recording.
+    preset: of sensors, "": the scenario's. bad: indices of machines with `bad_machine`'s faults. let_in: indices
+    trusted by decision. calibrates, closed_tours: agent options. spans: with constant true errors. first_s: used part
+    of the recording.
     """
 
     name: str
@@ -65,7 +66,7 @@ def nothing(rows: Rows, scene: Scene, _: float) -> Tampered:
 
 
 def gain(rows: Rows, scene: Scene, factor: float) -> Tampered:
-    """The torque of the second machine reads too much."""
+    """The second machine's torque reads too high."""
     name = sorted(rows)[1]
     table, raw = rows[name].copy(), measured(rows[name])
     d = np.where(table["speed_mps"] >= 0, 1.0, -1.0)
@@ -75,7 +76,7 @@ def gain(rows: Rows, scene: Scene, factor: float) -> Tampered:
 
 
 def rolls_harder(rows: Rows, scene: Scene, share: float) -> Tampered:
-    """The second machine rolls harder on any ground, with right slopes: soft tyres, or a lie."""
+    """The second machine rolls harder everywhere, slopes correct: soft tyres, or a lie."""
     name = sorted(rows)[1]
     table = rows[name].copy()
     table["c_rr"] *= 1 + share
@@ -83,13 +84,13 @@ def rolls_harder(rows: Rows, scene: Scene, share: float) -> Tampered:
 
 
 def majority_off(rows: Rows, scene: Scene, zero: float) -> Tampered:
-    """The zeros of all but the last machine are off by the same."""
+    """All but the last machine share a bias."""
     off = {name: _with_zero(rows[name], zero, np.ones(len(rows[name]), np.bool_)) for name in sorted(rows)[:-1]}
     return Tampered({**rows, **off}, scene.truth.c_rr)
 
 
 def step_at_half(rows: Rows, scene: Scene, zero: float) -> Tampered:
-    """The zero of the second machine steps."""
+    """The second machine's bias steps at half time."""
     name = sorted(rows)[1]
     stamps = rows[name]["stamp_ns"]
     late: Bools = stamps >= (int(stamps.min()) + int(stamps.max())) // 2
@@ -97,7 +98,7 @@ def step_at_half(rows: Rows, scene: Scene, zero: float) -> Tampered:
 
 
 def other_ramps(rows: Rows, scene: Scene, step: float) -> Tampered:
-    """All ramps are of other ground than what is around them."""
+    """All ramps are of other ground than their surroundings."""
     truth = scene.truth
     out = {}
     for name, table in rows.items():
@@ -108,7 +109,7 @@ def other_ramps(rows: Rows, scene: Scene, step: float) -> Tampered:
 
 
 def rain(rows: Rows, scene: Scene, step: float) -> Tampered:
-    """It rains on dirt at half time; two machines drive only before it, and one only after it, whose cells count."""
+    """Rain on dirt at half time; two machines drive before it, one after it, whose cells are judged."""
     truth = scene.truth
     names = sorted(rows)
     stamps = rows[names[0]]["stamp_ns"]
@@ -146,18 +147,18 @@ CASES = (
 
 
 def tampered(case: FleetCase, rows: Rows, scene: Scene) -> Tampered:
-    """The samples of a case."""
+    """Samples of a case."""
     return TAMPERS[case.tamper](rows, scene, case.argument)
 
 
 def truth_places(table: Table, scene: Scene, name: str) -> Floats:
-    """Where a machine truly was (n, 2); outside of the site where that is not known."""
+    """True places (n, 2); off the site where unknown."""
     place = scene.tracks[name].at(table["stamp_ns"]).place_m
     return np.where(np.isfinite(place), place, -1e6)
 
 
 def cells(place_m: Floats, scene: Scene) -> tuple[Floats, Floats]:
-    """Row and column of places (n, 2), of the nearest cell where they are outside."""
+    """Row and column of places (n, 2), clipped to the site."""
     truth = scene.truth
     column, row = np.floor((place_m - [truth.west_m, truth.south_m]) / truth.cell_m).astype(np.int64).T
     rows, columns = truth.c_rr.shape
@@ -165,7 +166,7 @@ def cells(place_m: Floats, scene: Scene) -> tuple[Floats, Floats]:
 
 
 def _ahead(table: Table) -> Floats:
-    """Unit vectors (n, 2) of the headings."""
+    """Unit heading vectors (n, 2)."""
     heading = table["heading_rad"].astype(np.float64)
     return np.stack([np.cos(heading), np.sin(heading)], axis=1)
 
@@ -175,7 +176,7 @@ def _gradient(table: Table) -> Floats:
 
 
 def _with_zero(table: Table, zero: float, where: Bools) -> Table:
-    """Samples of a machine whose accelerometer is off by more, where that holds."""
+    """Samples with an added accelerometer bias where selected."""
     out = table.copy()
     d, off = np.where(table["speed_mps"] >= 0, 1.0, -1.0), np.where(where, zero, 0.0)
     out["c_rr"] += d * off
@@ -186,7 +187,7 @@ def _with_zero(table: Table, zero: float, where: Bools) -> Table:
 
 
 def _with_ground(table: Table, step: Floats) -> Table:
-    """Samples (n,) of ground with other c_rr by so much (n,)."""
+    """Samples (n,) on ground of c_rr changed by step (n,)."""
     out = table.copy()
     out["c_rr"] += step
     return out

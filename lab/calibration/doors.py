@@ -1,7 +1,7 @@
-"""The same drive through two doors: readings in bundles, and the bytes of receivers with all else in bundles.
+"""The same drive by two inputs: readings in bundles, and receiver bytes with the rest in bundles.
 
-The host's clock is simulated, and messages come as late as links make them: no wall clock is in it. Bytes go through
-the framer, decoders and time base of an agent; the server's own calibration, fold and read make the maps.
+The host clock and link delays are simulated, without wall clock. Bytes pass an agent's framer, decoders and time base;
+maps come from the server's calibration, fold and read.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from sitegrid.proof.figures import Report, Row, root_mean_square, rounded
 from sitegrid.proof.tracks import read_load_track
 
 MACHINES = 3
-BOOT_NS = 5_000 * 10**9  # of the host's monotonic clock as the drive begins
-LATE_S = 0.004  # mean of what a link delays the bytes of 50 ms
+BOOT_NS = 5_000 * 10**9  # host's monotonic clock at the start
+LATE_S = 0.004  # mean link delay of 50 ms of bytes
 DIGITS = 4
 
 
 @dataclass(frozen=True)
 class Door:
-    """What receivers speak."""
+    """A receiver format."""
 
     name: str
 
@@ -56,7 +56,7 @@ DOORS = Door("ubx"), Door("nmea")
 
 @dataclass(frozen=True)
 class Compared:
-    """One seed. rmse_m: of smoothed places; wrong_pct: of driven cells; by bundles alone, and by bytes."""
+    """One seed, by (bundles, bytes). rmse_m: smoothed positions. wrong_pct: driven cells."""
 
     rmse_m: tuple[float, float]
     wrong_pct: tuple[float, float]
@@ -64,7 +64,7 @@ class Compared:
 
 
 def run(runner: Runner, seeds: Sequence[int], seconds: float) -> tuple[Report, list[Compared]]:
-    """A row per format: means over the seeds, and the ratios of these means."""
+    """A row per format: means over seeds, and their ratios."""
     tasks = [Task(door, seed, seconds) for seed in seeds for door in DOORS]
     results = runner.run(EXPERIMENT, tasks)
     rows = [_row(door, results[i :: len(DOORS)]) for i, door in enumerate(DOORS)]
@@ -86,7 +86,7 @@ def _row(door: Door, results: Sequence[Compared]) -> Row:
 
 
 def _solve(task: Task[Door], _: Path) -> Compared:
-    """Drive, and make the map twice."""
+    """Drive, and make both maps."""
     format_ = task.variant.name
     config = SimConfig(
         "paper_site", world="fast", machines=MACHINES, seed=task.seed, seconds=task.seconds, receivers=format_
@@ -107,7 +107,7 @@ def _solve(task: Task[Door], _: Path) -> Compared:
 
 
 def through(rig: Rig, format_: str, spans: Sequence[Sequence[Reading]], seed: int) -> list[Reading]:
-    """What an agent reads of a machine whose receivers speak, each span at once, with a link's delay."""
+    """An agent's readings from a machine's receivers, span by span with link delay."""
     wirings, draw = wire(rig, format_), np.random.default_rng(seed)
     lines = [(SimulatedReceiver(wiring), Line(format_, wiring.feeds)) for wiring in wirings]
     pieces, first_ns = [], spans[0][0].stamp_ns

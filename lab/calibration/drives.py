@@ -1,4 +1,4 @@
-"""Recordings of whole fleets, and the samples that each machine's agent makes of its own."""
+"""Recordings of fleets, and the samples of each agent."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from sim.truth import MAP_FILE, TruthMap
 from sitegrid.logs.sensors import select
 from sitegrid.proof.tracks import LoadTrack, read_load_track
 
-CHUNK = 5000  # readings that a pipeline gets at a time
+CHUNK = 5000  # readings per pipeline step
 
 
 @dataclass(frozen=True)
 class FleetDrive(PlannedDrive):
-    """All machines of a scenario on one ground. count: of the machines of its first fleet, 0 as the scenario has it."""
+    """All machines of a scenario. count: in its first fleet, 0: as in the scenario."""
 
     count: int = 0
 
     @property
     def scenario_toml(self) -> str:
-        """The scenario file of this drive."""
+        """Scenario file."""
         top = {"base": self.setup.scenario, "world": self.setup.world}
         if not self.count:
             return f"{toml_of(top)}\n"
@@ -47,25 +47,24 @@ class FleetDrive(PlannedDrive):
 
     @property
     def machines(self) -> int:
-        """How many drive."""
+        """Number of machines."""
         return self.count or sum(fleet.size for fleet in load_scenario(self.setup.scenario).fleet)
 
 
 def planned(
     scenario: str, seed: int, seconds: float, count: int = 0, preset: str = "", world: str | None = None
 ) -> FleetDrive:
-    """A drive of a scenario with the sensors of a preset, or with those that its file has, in a world or in its own."""
+    """Drive of a scenario; sensors and world default to the scenario's."""
     preset = preset or load_scenario(scenario).fleet[0].preset
     return FleetDrive(seed, seconds, preset, Setup(scenario, (), (), (), world=world), count)
 
 
 @dataclass(frozen=True)
 class Agent:
-    """One machine of a drive, by its place among the names.
+    """One machine of a drive, by index.
 
-    calibrates: by its own work; closed_tours: by these as well; first_s: of the recording; bad: see `spoiled`.
-    blind: it is not told that hydraulics load its engine.
-    configuration: its filter and sensors, None for those that it has.
+    calibrates: by its work; closed_tours: also by these. first_s: used part of the recording. bad: see `spoiled`.
+    blind: unaware of hydraulic engine load. configuration: filter and sensors, None: its own.
     """
 
     index: int
@@ -78,7 +77,7 @@ class Agent:
 
     @property
     def name(self) -> str:
-        """Short and unique."""
+        """Short unique name."""
         first = f"-{self.first_s:g}s" * (self.first_s > 0)
         return (
             f"machine{self.index}"
@@ -93,7 +92,7 @@ class Agent:
 
 @dataclass(frozen=True)
 class AgentSamples:
-    """What an agent made of a recording. live: the same samples (n,) at the places that were known at once."""
+    """An agent's samples. live: the same (n,) at real-time positions."""
 
     samples: Table
     live: Table
@@ -101,15 +100,15 @@ class AgentSamples:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is true of a drive: its ground, and the tracks of all machines by name."""
+    """Truth of a drive: ground, and all machines' tracks by name."""
 
     truth: TruthMap
     tracks: Mapping[str, LoadTrack]
 
 
-@lru_cache(maxsize=4)  # the cases of a drive come one after the other
+@lru_cache(maxsize=4)  # the cases of a drive follow one another
 def scene(drive: PlannedDrive, cache: Path) -> Scene:
-    """The truth of a recorded drive."""
+    """Truth of a recorded drive."""
     folder = drive.folder(cache)
     tracks = {
         logs.name: read_load_track(
@@ -121,7 +120,7 @@ def scene(drive: PlannedDrive, cache: Path) -> Scene:
 
 
 def _logs(folder: Path) -> list[Path]:
-    """The log folders of all machines, by name."""
+    """Log folders of all machines, by name."""
     return sorted(path for path in (folder / "logs").iterdir() if path.is_dir())
 
 
@@ -129,7 +128,6 @@ def _logs(folder: Path) -> list[Path]:
 
 
 def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
-    """Run one machine's pipeline."""
     assert task.drive
     site, machine, readings = _read(_logs(task.drive.folder(cache))[task.variant.index])
     if task.variant.first_s:
@@ -149,22 +147,22 @@ def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
 
 
 def all_samples(pipeline: Pipeline, readings: Sequence[Reading]) -> Samples:
-    """All samples that a pipeline makes of readings, as they were known at once, and the same ones final."""
+    """All samples of a pipeline, live and final."""
     made = [pipeline.step(readings[i : i + CHUNK]) for i in range(0, len(readings), CHUNK)]
     return joined([*made, pipeline.finish()])
 
 
-@lru_cache(maxsize=1)  # the configurations of a lone machine come one after the other
+@lru_cache(maxsize=1)  # one machine's configurations follow one another
 def _read(folder: Path) -> tuple[SiteConfig, MachineConfig, tuple[Reading, ...]]:
-    """What the agent of a machine may know and read, of its log folder."""
+    """What a machine's agent may know and read."""
     log = open_log(folder)
     return log.site, log.machine, tuple(log.readings())
 
 
 def spoiled(machine: MachineConfig, readings: Iterable[Reading]) -> tuple[MachineConfig, tuple[Reading, ...]]:
-    """A machine and its readings with the faults of the scenario `bad_machine`, on whatever recording.
+    """Apply the faults of scenario `bad_machine` to any recording.
 
-    That an antenna sits elsewhere than is configured is the same as a configuration that says so of one that does not.
+    A displaced antenna equals a configuration that states a wrong mount.
     """
     (fault,) = load_scenario("bad_machine").fault
     off = np.array(fault.antenna_off_m)

@@ -1,7 +1,7 @@
-"""What calibration by the fleet gives the map: every case before, after, and with the errors that the truth shows.
+"""Effect of calibration on the map: every case before, after, and with true errors removed.
 
-Recordings of PyBullet drives are replayed by whole pipelines with estimated, smoothed positions. The samples go through
-the server's own ledger, solver, trust, correction, fold and read.
+Recordings of PyBullet drives are replayed by whole pipelines with estimated, smoothed positions, then pass the server's
+ledger, solver, trust, correction, fold and read.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mapserver.trust.tuning import TUNING as TRUST
 from mapserver.trust.tuning import TrustTuning
 from sitegrid.proof.figures import Report, Row, root_mean_square, rounded
 
-LOADERS = 4  # of a drive of the paper's site with the usual sensors
+LOADERS = 4  # on the paper's site with usual sensors
 DIGITS = 4
 
 
@@ -36,7 +36,7 @@ def run(
     tuning: CalibrationTuning = TUNING,
     trust: TrustTuning = TRUST,
 ) -> tuple[Report, dict[FleetCase, list[CaseResult]]]:
-    """Record, replay, calibrate and judge all cases with all seeds; a row per case and map, means over the seeds."""
+    """Record, replay, calibrate and judge all cases and seeds; a row per case and map, means over seeds."""
     wanted = {
         (drive, agent): replay_task(agent, drive)
         for seed in seeds
@@ -59,7 +59,7 @@ def run(
 
 
 def _drive(case: FleetCase, seed: int, seconds: float) -> FleetDrive:
-    """The recording of a case: cases of the paper's site with the usual sensors share one of four loaders."""
+    """Recording of a case; cases on the paper's site with usual sensors share one of four loaders."""
     if case.scenario != PAPER:
         return planned(case.scenario, seed, seconds)
     return planned(PAPER, seed, seconds, case.machines if case.preset else LOADERS, case.preset)
@@ -72,9 +72,9 @@ def _agents(case: FleetCase, drive: FleetDrive) -> list[Agent]:
 
 
 def row_of(case: str, name: str, results: Sequence[CaseResult]) -> Row:
-    """Of one map of a case: means over the seeds, and errors of zeros and scales of all seeds.
+    """One map of a case: means over seeds, and errors of biases and scales.
 
-    change, from_oracle, slope_change: how much more of the map after is wrong than before and of the oracle [points].
+    change, from_oracle, slope_change: wrong cells against before and the oracle [points].
     """
     by_seed = [figures_of(result, name) for result in results]
     wrong, change, from_oracle = (column(by_seed, each) for each in ("wrong_pct", "change_pct", "from_oracle_pct"))
@@ -98,12 +98,12 @@ def row_of(case: str, name: str, results: Sequence[CaseResult]) -> Row:
 
 
 def _rms(results: Sequence[CaseResult], errors: str | None) -> float:
-    """Root mean square of errors of all seeds; NaN of a map that has none."""
+    """RMS over all seeds; NaN for maps without corrections."""
     return root_mean_square(np.concatenate([getattr(result, errors) for result in results])) if errors else math.nan
 
 
 def figures_of(result: CaseResult, name: str) -> Row:
-    """Wrong cells of one map with one seed, in percent, and against the map before and the oracle."""
+    """Wrong cells of one map and seed [%], also against before and the oracle."""
     own, before, oracle = (result.maps[each].figures for each in (name, "before", "oracle"))
     return {
         **own,

@@ -1,4 +1,4 @@
-"""One case: its samples through the server's ledger, solver, trust, correction, fold and read, and the maps judged."""
+"""One case through the server's ledger, solver, trust, correction, fold and read; maps judged."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from sitegrid.proof.map_score import border_distance, driven_cells
 
 MAPS = ("before", "after", "oracle")
 FIGURES = ("wrong_pct", "interior_pct", "slope_pct")
-BATCH = 100  # samples of one machine at a time, as trust sees them
-INTERIOR_M = 2.0  # from a border of soils
-OUTLIER = 3.0  # typical errors beyond which a sample does not count
+BATCH = 100  # samples of one machine at a time, in trust's order
+INTERIOR_M = 2.0  # from soil borders
+OUTLIER = 3.0  # typical errors beyond which samples are ignored
 
 
 @dataclass(frozen=True)
 class JudgedMap:
-    """One map: FIGURES by name; of its cells (rows, columns) the classes, estimated and true, and which were passed."""
+    """One map: FIGURES; per cell (rows, columns) estimated and true class, and whether passed."""
 
     figures: Mapping[str, float]
     estimated: Ints
@@ -47,10 +47,10 @@ class JudgedMap:
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One case with one seed, each map by its name. zeros, scales: errors of the corrections, over their std too.
+    """One case and seed; maps by name. zeros, scales: errors of corrections, also over their standard deviation.
 
-    applied: errors of the zeros that agents applied in the end. common: whether the common scale is observed, and why
-    not. distrusted: by trust, with reasons.
+    applied: errors of the agents' final biases. common: whether the common scale is observed, else why not. distrusted:
+    machines with reasons.
     """
 
     maps: Mapping[str, JudgedMap]
@@ -69,7 +69,7 @@ def solved(
     tuning: CalibrationTuning = TUNING,
     trust: TrustTuning = TRUST,
 ) -> CaseResult:
-    """Calibrate a case's samples, and judge its maps."""
+    """Calibrate a case's samples and judge its maps."""
     data = tampered(case, recorded, true)
     names = sorted(data.rows)
     distrusted = accused(data.rows, calibrated(data.rows, tuning=tuning), trust)
@@ -93,19 +93,19 @@ def solved(
 
 
 def served(rows: Rows) -> dict[str, Table]:
-    """The samples that the server folds: of the machines that it trusts, corrected by its calibration."""
+    """Samples folded by the server: trusted machines, corrected."""
     distrusted = accused(rows, calibrated(rows))
     result = calibrated(rows, distrusted)
     return {name: corrected(rows[name], of_machine(result, name)) for name in sorted(rows) if name not in distrusted}
 
 
 def of_machine(result: Solution, name: str) -> list[Correction]:
-    """The corrections of one machine."""
+    """Corrections of one machine."""
     return [each for each in result.corrections if each.machine == name]
 
 
 def accused(rows: Rows, result: Solution, tuning: TrustTuning = TRUST) -> dict[str, str]:
-    """Machines that the server's trust excludes, and why: it judges corrected samples, which come in turn."""
+    """Machines excluded by trust, with reasons; it judges corrected samples in turn."""
     auditor = Auditor(CELL_M, tuning=tuning)
     right = {name: corrected(table, of_machine(result, name)) for name, table in rows.items()}
     for first in range(0, max(map(len, right.values())), BATCH):
@@ -116,7 +116,7 @@ def accused(rows: Rows, result: Solution, tuning: TrustTuning = TRUST) -> dict[s
 
 
 def calibrated(rows: Rows, excluded: Collection[str] = (), tuning: CalibrationTuning = TUNING) -> Solution:
-    """What the server's ledger and solver make of samples."""
+    """Result of the server's ledger and solver."""
     config, stays = ServerConfig(), {}
     for name, table in rows.items():
         ledger = StayLedger()
@@ -126,7 +126,7 @@ def calibrated(rows: Rows, excluded: Collection[str] = (), tuning: CalibrationTu
 
 
 def judged(rows: Rows, data: Tampered, true: Scene) -> JudgedMap:
-    """The server's map of these samples, over the cells that the machines truly passed."""
+    """The server's map of these samples on truly passed cells."""
     truth, c_rr = true.truth, data.c_rr
     layers = folded(rows.items(), window_of(truth), ("resistance",))
     estimated, classes = resistance_class(layers["resistance"]), resistance_class(c_rr)
@@ -143,13 +143,13 @@ def judged(rows: Rows, data: Tampered, true: Scene) -> JudgedMap:
 
 
 def as_correction(name: str, error: TrueError) -> Correction:
-    """What takes the true error off."""
+    """The correction that removes the true error."""
     scale = error.scale / (1 + error.scale)
     return Correction(name, error.from_ns, error.to_ns, error.zero, scale, error.across, ())
 
 
 def _off(rows: Table, own: Sequence[Correction], error: TrueError) -> tuple[float, float, float, float]:
-    """Errors of a machine's corrections, of the zero and of the scale k, and what they state as standard deviation."""
+    """Errors of a machine's bias and scale correction, and their stated standard deviations."""
     if not own:
         return -error.zero, -error.scale, ZERO_STD, SCALE_STD
     stamps = rows["stamp_ns"][(rows["stamp_ns"] >= error.from_ns) & (rows["stamp_ns"] < error.to_ns)]
@@ -165,7 +165,7 @@ def _off(rows: Table, own: Sequence[Correction], error: TrueError) -> tuple[floa
 
 @dataclass(frozen=True)
 class TrueError:
-    """What a machine's samples are off by from a stamp to another, fitted against the truth."""
+    """A machine's true error over a span of stamps, fitted against the truth."""
 
     from_ns: int
     to_ns: int
@@ -175,9 +175,9 @@ class TrueError:
 
 
 def true_errors(data: Tampered, name: str, true: Scene, spans: int) -> list[TrueError]:
-    """Zero and scale of what a machine measured, in equal spans of its samples, by least squares to the true ground.
+    """Bias and scale of a machine in equal spans of its samples, least squares against true ground.
 
-    Samples near borders of soils do not count, nor those further off than OUTLIER typical errors.
+    Samples near soil borders and outliers are ignored.
     """
     rows = measured(data.rows[name])
     oldest, newest = int(rows["stamp_ns"].min()), int(rows["stamp_ns"].max())
@@ -190,7 +190,7 @@ def true_errors(data: Tampered, name: str, true: Scene, spans: int) -> list[True
 
 
 def _fit(rows: Table, c_rr: Floats32, name: str, true: Scene) -> tuple[float, float, float]:
-    """Zero, scale error k and lateral zero of these samples."""
+    """Bias, scale error k, lateral bias."""
     track = true.tracks[name].at(rows["stamp_ns"])
     at = cells(truth_places(rows, true, name), true)
     ground, border_m = c_rr[at].astype(np.float64), border_distance(resistance_class(c_rr), true.truth.cell_m)[at]

@@ -1,1 +1,1 @@
-"""What all experiments share: recordings, tasks on all cores whose results are kept, goals and result pages."""
+"""Shared by experiments: recordings, parallel tasks with cached results, goals, result pages."""

@@ -1,4 +1,4 @@
-"""Which code a result depends on: a module, all that it imports of this project, and the data beside them."""
+"""Code and data that a result depends on: a module and its imports in this project."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 DATA = (".toml", ".urdf")
-JUDGED_ANEW = "goals.toml"  # whatever it says, results stay
+JUDGED_ANEW = "goals.toml"  # judges results, does not change them
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 @cache
 def code_version(*modules: str) -> str:
-    """Digest of modules, of what they import, and so on; ModuleNotFoundError where this project has not one of them.
+    """Digest of modules with all their imports; ModuleNotFoundError if one is not in this project.
 
-    Comments, docstrings and layout do not count, so that results outlive what is only said in another way.
+    Comments, docstrings and layout are excluded, so that results survive rewording.
     """
     if missing := [name for name in modules if _path(name) is None]:
         raise ModuleNotFoundError(missing[0])
@@ -36,18 +36,18 @@ def code_version(*modules: str) -> str:
 
 
 def digest(*texts: str) -> str:
-    """Ten hex digits that tell texts apart."""
+    """Ten hex digits that distinguish texts."""
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:10]
 
 
 def _path(name: str) -> Path | None:
-    """The file of a module of this project; None of anything else."""
+    """File of a module of this project, else None."""
     path = ROOT.joinpath(*name.split("."))
     return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if name and file.is_file()), None)
 
 
 def _imported(tree: ast.Module) -> Iterator[str]:
-    """Names that may be modules; an import within a function counts too."""
+    """Possible module names, including imports in functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (each.name for each in node.names)
@@ -57,7 +57,7 @@ def _imported(tree: ast.Module) -> Iterator[str]:
 
 
 def _counting(tree: ast.Module) -> str:
-    """What results depend on: the syntax tree without docstrings."""
+    """The syntax tree without docstrings."""
     for node in ast.walk(tree):
         if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
             del node.body[0]

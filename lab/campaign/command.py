@@ -1,4 +1,4 @@
-"""What the commands of experiments share: options, and an experiment that is run and printed."""
+"""Shared by experiment commands: options, running, printing."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from sitegrid.proof.figures import Report
 
 DEFAULT_SEEDS, DEFAULT_S = 12, 1200.0
 QUICK = "a small version of its own, in about a minute: to see that all works"
-Work = Callable[[Runner], tuple[Report, Any]]  # a report, and what it is made of
+Work = Callable[[Runner], tuple[Report, Any]]  # a report, and its raw results
 
 
 def add_runs(parser: ArgumentParser, seconds: float | None = None, *, cases: bool = False) -> None:
-    """Options of an experiment with seeds. seconds: of a recording, if it makes any; cases: whether it has some."""
+    """Options of a seeded experiment. seconds: of a recording, if any. cases: whether it has cases."""
     parser.add_argument("--seeds", type=count, default=DEFAULT_SEEDS, help="number of seeds (default %(default)s)")
     parser.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
@@ -39,22 +39,22 @@ def add_runs(parser: ArgumentParser, seconds: float | None = None, *, cases: boo
 
 
 def add_processes(parser: ArgumentParser) -> None:
-    """How many processes work."""
+    """Number of processes."""
     parser.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
 
 
 def add_quick(parser: ArgumentParser) -> None:
-    """The quick version of an experiment."""
+    """Option for the quick version."""
     parser.add_argument("--quick", action="store_true", help=QUICK)
 
 
 def seeds_of(arguments: Namespace) -> range:
-    """The seeds that are asked for."""
+    """Seeds from the options."""
     return range(arguments.first_seed, arguments.first_seed + arguments.seeds)
 
 
 def is_quick(arguments: Namespace) -> bool:
-    """Whether the quick version is asked for; ConfigError where it is, and drives of another length or other seeds."""
+    """Whether the quick version is requested; ConfigError beside other drive options."""
     if arguments.quick and (seeds_of(arguments), arguments.seconds) != (range(DEFAULT_SEEDS), DEFAULT_S):
         raise ConfigError("--quick", "has a drive of its own: leave out --seeds, --first-seed and --seconds")
     return bool(arguments.quick)
@@ -66,11 +66,11 @@ def perform(
     work: Work,
     readable: Callable[[Report], Report] = lambda report: report,
 ) -> int:
-    """Run an experiment with its progress shown, and print its report; returns the exit code.
+    """Run an experiment with progress and print its report; returns the exit code.
 
-    readable: of the report what people read.
+    readable: shortens the report for people.
     """
-    raise_interrupts()  # the bar hides the cursor of the terminal
+    raise_interrupts()  # the progress bar hides the cursor
     with Display(title, headless=arguments.json, kept=arguments.out) as display:
         runner = Runner(arguments.out, arguments.processes or cores(), display.show)
         report, _ = work(runner)
@@ -81,10 +81,10 @@ def perform(
 
 
 def seeded(module: str, title: str) -> Callable[[Namespace], int]:
-    """The `run` of a command whose experiment takes seeds, seconds and perhaps cases; it is in `module`."""
+    """The `run` of a command whose experiment in `module` takes seeds, seconds and perhaps cases."""
 
     def run(arguments: Namespace) -> int:
-        experiment = import_module(module)  # here, so that `--help` is quick
+        experiment = import_module(module)  # keeps `--help` quick
         options: dict[str, Any] = {"seeds": seeds_of(arguments), "seconds": arguments.seconds}
         if hasattr(arguments, "cases"):
             options["cases"] = chosen(experiment.CASES, arguments.cases)
@@ -94,7 +94,7 @@ def seeded(module: str, title: str) -> Callable[[Namespace], int]:
 
 
 def show(arguments: Namespace, report: Report, readable: Callable[[Report], Report] = lambda report: report) -> None:
-    """Print a report: with `--json` one object, with `made`, where it comes from."""
+    """Print a report; with `--json` as one object with its provenance in `made`."""
     if arguments.json:
         say(plain({"made": made_by(arguments.words), **report}))
     else:

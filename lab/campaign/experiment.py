@@ -1,7 +1,7 @@
-"""The runner of all experiments: tasks are worked off on all cores, and every result is kept in a file.
+"""Runner of all experiments: parallel tasks, each result cached in a file.
 
-The file is named by everything that the result depends on. So an interrupted run goes on where it was, and other code
-or options never meet old results.
+The file name digests everything the result depends on: interrupted runs resume, and results of other code or options
+are never reused.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from lab.campaign.workers import each
 from protocol.errors import SitegridError, StoreError
 from protocol.files import whole_file
 
-Progress = Callable[[float, float, str], None]  # simulated seconds done, all of them, what was done last
+Progress = Callable[[float, float, str], None]  # simulated seconds done, total, last job
 
 
 class Named(Protocol):
-    """What an experiment compares."""
+    """A variant under comparison."""
 
     @property
     def name(self) -> str:
-        """Short and unique."""
+        """Short unique name."""
         ...
 
 
@@ -39,7 +39,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Task(Generic[Variant]):
-    """One variant with one seed. seconds: simulated. drive: the recording that it needs."""
+    """One variant and seed. seconds: simulated. drive: its recording, if any."""
 
     variant: Variant
     seed: int
@@ -48,7 +48,7 @@ class Task(Generic[Variant]):
 
     @property
     def name(self) -> str:
-        """For people and for files."""
+        """Name for people and files."""
         return f"seed{self.seed}-{self.variant.name}"
 
     def recording(self, cache: Path) -> RecordedDrive:
@@ -66,9 +66,9 @@ def replay_task(variant: Variant, drive: PlannedDrive) -> Task[Variant]:
 class Experiment(Generic[Variant, Result]):
     """How tasks become results.
 
-    name: folder of the results. result: their class, a dataclass whose fields are arrays or plain values of JSON.
-    solve: does one task, given the folder of recordings; a function of a module, as workers import it. A result depends
-    on that module, on what it imports, and on `also`: modules that other processes run.
+    name: folder of results. result: dataclass of arrays and JSON values. solve: does a task, given the folder of
+    recordings; module-level, for workers. A result depends on its module, the imports, and `also`: modules run by other
+    processes.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Experiment(Generic[Variant, Result]):
     also: tuple[str, ...] = ()
 
     def file(self, task: Task[Variant], cache: Path) -> Path:
-        """Where the result of a task is kept."""
+        """Result file of a task."""
         recording = task.drive.folder(cache).name if task.drive else ""
         modules = self.solve.__module__, *self.also
         return cache / self.name / f"{task.name}-{digest(repr(task), recording, code_version(*modules))}.npz"
@@ -85,19 +85,19 @@ class Experiment(Generic[Variant, Result]):
 
 @dataclass(frozen=True)
 class Runner:
-    """Where and how experiments run. cache: folder of recordings and results. processes: how many at a time."""
+    """Cache folder of recordings and results, and number of processes."""
 
     cache: Path
     processes: int = 1
     on_progress: Progress = lambda *_: None
 
     def record(self, drives: Sequence[PlannedDrive]) -> None:
-        """Record what is not recorded."""
+        """Make missing recordings."""
         missing = [drive for drive in drives if not drive.folder(self.cache).exists()]
         self._record(missing, 0.0, sum(drive.seconds for drive in missing))
 
     def run(self, experiment: Experiment[Variant, Result], tasks: Sequence[Task[Variant]]) -> list[Result]:
-        """Record what is not recorded, do the tasks whose result is not there; returns all results, task by task."""
+        """Make missing recordings and results; returns all results in task order."""
         files = [experiment.file(task, self.cache) for task in tasks]
         waiting = [(task, file) for task, file in zip(tasks, files, strict=True) if not file.exists()]
         drives = dict.fromkeys(task.drive for task, _ in waiting if task.drive)
@@ -112,7 +112,7 @@ class Runner:
         return [read_result(experiment.result, file) for file in files]
 
     def _record(self, drives: Sequence[PlannedDrive], done_s: float, total_s: float) -> float:
-        """Record these; returns the simulated seconds that are done then."""
+        """Record drives; returns simulated seconds done."""
         for (drive, _), _ in each(_record, [(drive, self.cache) for drive in drives], self.processes):
             done_s += drive.seconds
             self.on_progress(done_s, total_s, f"recorded seed {drive.seed} {drive.preset}")
@@ -120,14 +120,14 @@ class Runner:
 
 
 def write_result(result: Any, file: BinaryIO) -> None:
-    """Write a dataclass: its arrays as such, everything else as JSON."""
+    """Write a dataclass: arrays as such, the rest as JSON."""
     columns = {field.name: getattr(result, field.name) for field in fields(result)}
     plain = {name: json.dumps(value) for name, value in columns.items() if not isinstance(value, np.ndarray)}
     np.savez_compressed(file, **{**columns, **plain})
 
 
 def read_result(kind: type[Result], path: Path) -> Result:
-    """Read what `write_result` wrote; a StoreError where that is damaged."""
+    """Read what `write_result` wrote; StoreError if damaged."""
     try:
         with path.open("rb") as file, np.load(file) as columns:
             return kind(**{name: value if value.ndim else json.loads(str(value)) for name, value in columns.items()})
@@ -143,7 +143,7 @@ def _record(job: tuple[PlannedDrive, Path]) -> None:
 
 
 def _work(job: tuple[Experiment[Variant, Result], Task[Variant], Path, Path]) -> None:
-    """Do one task; SitegridError if this process read other code than the one that named the file."""
+    """Do one task; SitegridError if this process has other code than the file's name."""
     experiment, task, cache, file = job
     if experiment.file(task, cache) != file:
         raise SitegridError("the sources changed during the run: start it again, it goes on where it was")

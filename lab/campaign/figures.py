@@ -1,4 +1,4 @@
-"""What experiments make of figures: intervals over seeds, rows that are chosen, and goals."""
+"""Rows and goals of experiments."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from sitegrid.proof.figures import Row
 
 @dataclass(frozen=True)
 class Goal:
-    """A limit for one figure of the rows that have these values.
+    """Limit of one figure for the rows with these values.
 
-    A figure that must not exceed its limit counts by its size, so that a bias may be negative.
+    Upper limits apply to the absolute value, because a bias may be negative.
     """
 
     row: Mapping[str, Any]
@@ -22,16 +22,16 @@ class Goal:
     limit: float
 
     def is_met(self, value: float | None) -> bool:
-        """Whether a value keeps the limit; what is not known (None, NaN) does not."""
+        """Whether a value keeps the limit; unknown ones (None, NaN) do not."""
         if value is None:
             return False
         return bool(abs(value) <= self.limit if self.relation == "<=" else value >= self.limit)
 
 
 def judge(goals: Sequence[Goal], rows: Sequence[Row]) -> list[Row]:
-    """Compare rows with the goals that concern them; `name`: of the figure.
+    """Judge rows by their goals; `name`: of the figure.
 
-    `row`: the values that choose it, and the names by which it differs from others that they choose.
+    `row`: the selecting values, plus names that distinguish rows selected together.
     """
     out = []
     for goal in goals:
@@ -49,5 +49,5 @@ def judge(goals: Sequence[Goal], rows: Sequence[Row]) -> list[Row]:
 
 
 def select(rows: Iterable[Row], values: Mapping[str, Any]) -> list[Row]:
-    """The rows that have these values."""
+    """Rows with these values."""
     return [row for row in rows if values.items() <= row.items()]

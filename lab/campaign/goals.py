@@ -13,7 +13,7 @@ FILE = ROOT / "lab" / "goals.toml"
 
 
 def goals(rows: str) -> tuple[Goal, ...]:
-    """The goals of a list of rows, by its name in the file."""
+    """Goals of a list of rows, by its name in the file."""
     entries = tomllib.loads(FILE.read_text(encoding="utf-8"))[rows]
     return tuple(goal for entry in entries for goal in _goals(entry.pop("row"), entry))
 

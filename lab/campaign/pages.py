@@ -1,17 +1,17 @@
-"""Tables of result pages, made from the printed reports beside them: nobody types a figure.
+"""Fill tables of result pages from the printed reports beside them; no figure is typed.
 
     python -m lab roads --seeds 8 --first-seed 1000 --json > lab/results/roads.json
     python -m lab.campaign.pages lab/results/roads.md
 
-A page says where a table belongs, which report it is of and which table, and ends it with `<!-- end -->`:
+A page marks each table's place, report and kind; `<!-- end -->` closes it:
 
     <!-- table: roads.json made -->          command, commit, date, seeds and processor time
     <!-- table: roads.json goals -->         all goals, missed ones in bold
     <!-- table: paper.json forecasts -->     a list of rows, with all columns of plain values
     <!-- table: paper.json rows table=maps machines=1: filter gps net_m paper.net_m -->
 
-The last one has the rows with these values, `-` for none, and these columns; a dot leads into a value. A figure whose
-row has a half-width for it in `ci95` is shown with that.
+The last one selects rows by values (`-`: none) and columns; a dot descends into a value. Half-widths in a row's `ci95`
+are shown.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _NESTED = (list, dict)
 
 
 def filled(text: str, folder: Path) -> str:
-    """A page with its tables as the reports in a folder have them. ConfigError for a table that its report has not."""
+    """Fill a page's tables from a folder of reports. ConfigError if a report lacks one."""
 
     def table(block: re.Match[str]) -> str:
         begin, file, what, _, end = block.groups()
@@ -66,20 +66,20 @@ def _cases(report: Report) -> list[Row]:
 
 
 def made_table(report: Report) -> str:
-    """Where a report comes from."""
+    """Provenance of a report."""
     seeds, made = report.get("seeds", []), report[MADE]
     line = [f"`{made['command']}`", made["commit"], made["date"], _span(seeds), text_of(made["processor_min"])]
     return markdown(["command", "commit", "date", "seeds", "minutes of processor time, of what was not kept"], [line])
 
 
 def _span(seeds: Sequence[int]) -> str:
-    """Seeds in short where they follow one another."""
+    """Seeds, abbreviated if consecutive."""
     follow = len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[0] + len(seeds)))
     return f"{seeds[0]} to {seeds[-1]}" if follow else ", ".join(map(str, seeds))
 
 
 def goals_table(report: Report) -> str:
-    """Each goal with what was measured, in bold where it was missed, and what each seed gave where rows say so."""
+    """Goals with measurements, missed ones in bold, and values by seed if rows have them."""
     lines = []
     for goal in report[GOALS]:
         value = text_of(goal["value"]) or "not known"
@@ -95,14 +95,14 @@ def goals_table(report: Report) -> str:
 
 
 def rows_table(rows: Sequence[Row], columns: Sequence[str], path: Path) -> str:
-    """Rows with some columns, or with all that have plain values in every row."""
+    """Rows with these columns, or all columns of plain values."""
     names = columns or [name for name in rows[0] if not any(isinstance(row.get(name), _NESTED) for row in rows)]
     lines = [[_cell(row, name, path) for name in names] for row in rows]
     return markdown([f"`{name}`" for name in names], lines)
 
 
 def _matching(rows: Sequence[Row], values: Iterable[str], path: Path) -> list[Row]:
-    """The rows that have all of some values, each as NAME=VALUE; ConfigError where none has."""
+    """Rows that match all NAME=VALUE; ConfigError if none does."""
     wanted = [value.partition("=") for value in values]
     chosen = [row for row in rows if all(_named(row.get(name)) == value for name, _, value in wanted)]
     if not chosen:
@@ -111,7 +111,7 @@ def _matching(rows: Sequence[Row], values: Iterable[str], path: Path) -> list[Ro
 
 
 def _cell(row: Row, name: str, path: Path) -> str:
-    """A value with the half-width of its interval; a dot leads into it. ConfigError where a row has no such column."""
+    """A value with its interval's half-width; a dot descends. ConfigError for a missing column."""
     value: Any = row
     for part in name.split("."):
         if isinstance(value, Mapping) and part not in value:
@@ -127,13 +127,13 @@ def _named(value: Any) -> str:
 
 
 def markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """A table of Markdown, with its last line break."""
+    """A Markdown table with final newline."""
     rows = [head, ["---"] * len(head), *lines]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in rows)
 
 
 def text_of(value: Any) -> str:
-    """A figure as pages have it: whole numbers without a point, at most five digits; nothing for none."""
+    """A figure for pages: integers without point, at most five digits, empty for none."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if not isinstance(value, int | float) or not math.isfinite(value):
@@ -142,7 +142,7 @@ def text_of(value: Any) -> str:
 
 
 def main(paths: Sequence[str]) -> int:
-    """Fill pages; says which ones are others now."""
+    """Fill pages and report changed ones."""
     for path in map(Path, paths):
         before = path.read_text(encoding="utf-8")
         after = filled(before, path.parent)

@@ -1,6 +1,6 @@
-"""Where the figures of a report come from: the command, the commit of the code, and the date.
+"""Provenance of a report: command, commit, date.
 
-Results are kept by what they depend on, so whatever a report has, the code that printed it makes it.
+Results are cached by what they depend on, so the printing code would reproduce any report.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from lab.campaign.code import ROOT
 from protocol.version import package_version
 from sitegrid.proof.figures import Row
 
-# What changes no figure, and names places of one computer.
+# Options that change no figure, or name local paths.
 WITHOUT = ("--data", "--out", "--plots", "--processes", "--tensor")
 
 
 def made_by(words: Sequence[str]) -> Row:
-    """Of a report: `command`, `commit`, `date` of printing, and `processor_min`; words: what follows `python -m lab`.
+    """`command`, `commit`, `date` of printing and `processor_min` of a report; words: after `python -m lab`.
 
-    Minutes are of this process and its workers so far: of what was not kept from an earlier run.
+    Minutes of this process and its workers, without cached results.
     """
     command = shlex.join(["python", "-m", "lab", *_lasting(words)])
     used = [resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
@@ -33,7 +33,7 @@ def made_by(words: Sequence[str]) -> Row:
 
 
 def commit_of(folder: Path) -> str:
-    """The commit of a checkout, with `-dirty` where files are others; the version where there is none."""
+    """A checkout's commit, `-dirty` if modified; the version without a checkout."""
     words = ["git", "-C", str(folder), "describe", "--always", "--exclude=*", "--abbrev=8", "--dirty"]
     try:
         return subprocess.run(words, capture_output=True, check=True, text=True).stdout.strip()  # noqa: S603
@@ -42,7 +42,7 @@ def commit_of(folder: Path) -> str:
 
 
 def _lasting(words: Sequence[str]) -> Iterator[str]:
-    """The words without those that say where; of a path from the root its last part."""
+    """Words without local options; absolute paths reduced to their names."""
     left = iter(words)
     for word in left:
         if word in WITHOUT:

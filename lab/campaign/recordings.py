@@ -1,6 +1,6 @@
-"""Recordings of one machine on one route each, kept so that every configuration sees the same.
+"""Recordings of one machine on one route, cached so that all configurations see the same.
 
-What is kept is named by digests of the code and the options that it was made with.
+Names digest the code and options that made them.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from sitegrid.proof.tracks import Truth, read_track
 
 MACHINE = "loader"
 _scenario = cache(load_scenario)
-RECORDER = "sim.recorder"  # the code that recordings depend on
+RECORDER = "sim.recorder"  # code that recordings depend on
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What all drives of an experiment share: a scenario, routes that take turns with the seeds, and sensors.
+    """Common to an experiment's drives: scenario, routes in turn by seed, sensors.
 
-    Everything else of the machine is as the scenario's first fleet has it. world: over the scenario's. preset: of a
-    drive where its experiment names no other.
+    The machine is otherwise the first of the scenario's first fleet. world: overrides the scenario's. preset: default
+    of drives.
     """
 
     scenario: str
@@ -48,7 +48,7 @@ class Setup:
     preset: str = "paper"
 
 
-# IMUs 3 and 4 sit under the rear frame, which is `base_link`, 1 under the front one.
+# IMUs 3 and 4 are on the rear frame, `base_link`; 1 is on the front frame.
 PAPER = Setup("paper_site", ("west", "east", "middle"), gps=(1, 2, 3), imu=(3, 4, 1), attitude=(3, 4, 1))
 DRIVEN = replace(PAPER, scenario="paper_site_driven", preset="paper_shared")
 HAUL_ROAD = replace(PAPER, scenario="haul_road_driven", routes=("haul",), preset="dgps_shared")
@@ -57,7 +57,7 @@ SETUPS = {setup.scenario: setup for setup in (PAPER, DRIVEN, HAUL_ROAD)}
 
 @dataclass(frozen=True)
 class PlannedDrive:
-    """What is to be recorded: one machine on one route."""
+    """A recording to make: one machine on one route."""
 
     seed: int
     seconds: float
@@ -66,26 +66,26 @@ class PlannedDrive:
 
     @property
     def tour(self) -> str:
-        """Name of the route."""
+        """Route name."""
         return self.setup.routes[self.seed % len(self.setup.routes)]
 
     @property
     def fleet(self) -> FleetConfig:
-        """The machine, its route and sensors."""
+        """Machine, route and sensors."""
         s = self.setup
         first = replace(_scenario(s.scenario).fleet[0], name=MACHINE, count=None, other_way=False)
         return replace(first, routes=(self.tour,), preset=self.preset, gps=s.gps, imu=s.imu, attitude=s.attitude)
 
     @property
     def scenario_toml(self) -> str:
-        """The scenario file of this drive."""
+        """Scenario file."""
         setup = self.setup
         top = {"base": setup.scenario, "world": setup.world}
         return f"{toml_of(top)}\n\n[[fleet]]\n{toml_of(vars(self.fleet))}\n"
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of this drive; its ground is what an evaluation may know."""
+        """Scenario; its ground is for evaluation only."""
         alone = replace(_scenario(self.setup.scenario), fleet=(self.fleet,), fault=(), names=())
         return replace(alone, world=self.setup.world or alone.world, seed=self.seed, seconds=self.seconds)
 
@@ -95,7 +95,7 @@ class PlannedDrive:
         return self.scenario.rigs()[0].machine
 
     def folder(self, cache_dir: Path) -> Path:
-        """Where the recording lies; another simulator, another folder."""
+        """Recording folder; differs by simulator code."""
         key = digest(repr(self), self.scenario_toml, code_version(RECORDER))
         return cache_dir / f"{self.preset}-seed{self.seed}-{self.seconds:g}s-{key}"
 
@@ -108,11 +108,11 @@ class RecordedDrive:
     machine: MachineConfig
     readings: tuple[Reading, ...]
     truth: Truth
-    start: tuple[float, float, float]  # where it begins: x, y [m], heading [rad]
+    start: tuple[float, float, float]  # x, y [m], heading [rad]
 
 
 def make(drive: PlannedDrive, cache_dir: Path) -> Path:
-    """Record a drive unless that has been done; returns its folder, which is whole or not there."""
+    """Record a drive unless done; returns its folder, complete or missing."""
     folder = drive.folder(cache_dir)
     if folder.exists():
         return folder
@@ -127,9 +127,9 @@ def make(drive: PlannedDrive, cache_dir: Path) -> Path:
     return folder
 
 
-@lru_cache(maxsize=1)  # tasks come recording by recording
+@lru_cache(maxsize=1)  # tasks are grouped by recording
 def load(folder: Path) -> RecordedDrive:
-    """Read what `make` wrote, all sensors of it."""
+    """Read what `make` wrote, with all sensors."""
     log = open_log(folder / "logs" / MACHINE)
     track = track_file(folder)
     first = np.genfromtxt(track, delimiter=",", names=True, max_rows=1)
@@ -138,10 +138,10 @@ def load(folder: Path) -> RecordedDrive:
 
 
 def track_file(folder: Path) -> Path:
-    """Where a recording keeps the machine's true track."""
+    """The machine's true track in a recording."""
     return folder / "truth" / "tracks" / f"{MACHINE}.csv"
 
 
 def toml_of(values: Mapping[str, Any]) -> str:
-    """Plain values as TOML keys; None is none."""
+    """Plain values as TOML keys, without None."""
     return "\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items() if value is not None)

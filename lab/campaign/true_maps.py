@@ -1,4 +1,4 @@
-"""True maps as answers of a map server, and scores of several seeds in one."""
+"""True maps as map server answers; pooled scores."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sitegrid.proof.figures import Row
 
 
 def window_of(truth: TruthMap) -> CellWindow:
-    """The cells of a true map."""
+    """Cells of a true map."""
     rows, columns = truth.c_rr.shape
     return CellWindow(round(truth.west_m / truth.cell_m), round(truth.south_m / truth.cell_m), columns, rows)
 
 
 def region_of(truth: TruthMap, layers: Mapping[str, AnyArray]) -> Region:
-    """Layers of the cells of a true map, as an answer of a map server has them."""
+    """Layers on a true map's cells, as a map server's answer."""
     rows, columns = truth.c_rr.shape
     x_m, y_m = (
         np.asarray(corner_m + (np.arange(n) + 0.5) * truth.cell_m, np.float64)
@@ -31,12 +31,12 @@ def region_of(truth: TruthMap, layers: Mapping[str, AnyArray]) -> Region:
 
 
 def true_layers(truth: TruthMap) -> dict[str, Floats32]:
-    """The layers of a true map by their names."""
+    """A true map's layers by name."""
     return {"resistance": truth.c_rr, "grade_east": truth.grade_east, "grade_north": truth.grade_north}
 
 
 def pooled_by_border(seeds: Sequence[Sequence[Row]]) -> list[Row]:
-    """Bins of distances (`by_border_distance`) of several seeds in one: all cells, and which of the known are wrong."""
+    """Pool distance bins (`by_border_distance`) of several seeds."""
     return [_pooled(bins) for bins in zip(*seeds, strict=True)]
 
 

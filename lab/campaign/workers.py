@@ -1,4 +1,4 @@
-"""Jobs on all cores: processes that start afresh, so that nothing of one run leaks into another."""
+"""Parallel jobs in fresh processes, so that runs do not influence each other."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from protocol.errors import SitegridError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-# One thread for linear algebra per process: matrices are small, and the processor time of a filter is a result.
+# One linear algebra thread per process: matrices are small, and CPU time of filters is a result.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Usable cores."""
     return len(os.sched_getaffinity(0))
 
 
 def each(work: Callable[[Job], Result], jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Result]]:
-    """Do all jobs and yield them with their results as they end; `work` is a function of a module.
+    """Do all jobs; yields results as they end. `work`: module-level.
 
-    processes: 1 does them in this process. An error, or an interruption, ends with the jobs that are running.
+    processes: 1: in this process. Errors and interrupts end after the running jobs.
     """
     if processes == 1 or len(jobs) < 2:
         yield from ((job, work(job)) for job in jobs)
@@ -44,7 +44,7 @@ def each(work: Callable[[Job], Result], jobs: Sequence[Job], processes: int) -> 
 
 
 def _guarded(work: Callable[[Job], Result], job: Job) -> Result:
-    """Do a job; our errors make their own messages, and would not come through a pipe as what they are."""
+    """Our errors do not survive a pipe with their own types."""
     try:
         return work(job)
     except SitegridError as error:
@@ -52,7 +52,7 @@ def _guarded(work: Callable[[Job], Result], job: Job) -> Result:
 
 
 def _end_with_parent() -> None:
-    """A worker whose parent was killed would wait for work for ever; Ctrl-C ends it without a page of text."""
+    """Workers of a killed parent would wait forever; Ctrl-C ends them silently."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_watch_parent, daemon=True).start()
 
@@ -65,7 +65,7 @@ def _watch_parent() -> None:
 
 @contextmanager
 def environment(values: dict[str, str]) -> Iterator[None]:
-    """Set variables that child processes inherit."""
+    """Set environment variables for child processes."""
     before = {name: os.environ[name] for name in values if name in os.environ}
     os.environ.update(values)
     try:

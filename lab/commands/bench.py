@@ -1,4 +1,4 @@
-"""`python -m lab bench`: a benchmark of maps that others can enter (lab/benchmark/README.md)."""
+"""`python -m lab bench`: a public map benchmark (lab/benchmark/README.md)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def run(arguments: Namespace) -> int:
     from lab.campaign.experiment import Runner
     from lab.campaign.workers import cores
 
-    raise_interrupts()  # the bar hides the cursor of the terminal
+    raise_interrupts()  # the progress bar hides the cursor
     edition, processes = recordings.QUICK if arguments.quick else recordings.FULL, arguments.processes or cores()
     title = {"make": "fleets drive, agents make samples", "score": "maps are compared with the truth"}[arguments.what]
     kept = arguments.data if arguments.what == "make" else None
@@ -54,7 +54,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _readable(report: Report) -> Report:
-    """Rows without what is too wide to be read."""
+    """Rows without wide columns."""
     from lab.benchmark import recordings
 
     hidden = {"by_recording", *recordings.PARTS}

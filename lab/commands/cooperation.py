@@ -1,4 +1,4 @@
-"""`python -m lab cooperation`: what machines gain that draw one map."""
+"""`python -m lab cooperation`: benefit of a shared map."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ EXTRA = "lab"
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Options of the command; seconds are those of a lone machine, which drives the tours of all."""
+    """Options of the command; seconds: a lone machine's drive of all tours."""
     add_runs(parser, DEFAULT_S)
     add_quick(parser)
 
 
 def run(arguments: Namespace) -> int:
-    """Let one to eight machines draw one map."""
+    """One to eight machines draw one map."""
     from lab.cooperation import experiment
     from lab.cooperation.experiment import QUICK, Plan
 

@@ -1,4 +1,4 @@
-"""`python -m lab doors`: the same drives by readings in bundles, and by the bytes of receivers."""
+"""`python -m lab doors`: the same drives by bundles and by receiver bytes."""
 
 from functools import partial
 

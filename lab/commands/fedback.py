@@ -1,4 +1,4 @@
-"""`python -m lab fedback`: what lanes are worth that are fed back, and where they may harm."""
+"""`python -m lab fedback`: benefit and harm of lanes fed back."""
 
 from argparse import ArgumentParser, Namespace
 from typing import Any
@@ -15,14 +15,14 @@ EXTRA = "lab"
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Options of a run."""
+    """Options of the command."""
     add_runs(parser, seconds=420.0, cases=True)
     picture = "file to draw a machine into that loses GPS, the first of the case driven-lost"
     parser.add_argument("--picture", type=OutputFile((".png",)), metavar="FILE", help=picture)
 
 
 def run(arguments: Namespace) -> int:
-    """Run it, and draw."""
+    """Run and draw."""
     from lab.fedback import experiment
     from lab.fedback.blackout import lanes_of
 
@@ -33,7 +33,7 @@ def run(arguments: Namespace) -> int:
     def work(runner: Runner) -> tuple[Report, Any]:
         report, courses = experiment.run(runner, seeds=seeds, seconds=arguments.seconds, cases=cases)
         if arguments.picture:
-            from lab.fedback.picture import draw  # imported here: only pictures need matplotlib
+            from lab.fedback.picture import draw  # only pictures need matplotlib
 
             lanes = lanes_of(seeds[0], arguments.seconds, runner.cache)
             draw(lanes, courses[True][0], courses[False][0], arguments.picture)

@@ -1,4 +1,4 @@
-"""`python -m lab ground`: how right the estimate of the ground is."""
+"""`python -m lab ground`: accuracy of ground estimation."""
 
 from functools import partial
 

@@ -17,7 +17,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Merge the samples of all cases."""
+    """Merge all cases' samples."""
     from lab.maps import experiment
     from lab.maps.cases import select
 

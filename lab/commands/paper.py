@@ -45,7 +45,7 @@ def run(arguments: Namespace) -> int:
         if arguments.tensor:
             experiment.write_map(outcomes, runner, arguments.tensor)
         if arguments.plots:
-            from lab.paper.plots import draw  # imported here: only pictures need matplotlib
+            from lab.paper.plots import draw  # only pictures need matplotlib
 
             report["plots"] = list(map(str, draw(outcomes, runner, arguments.plots)))
         return report, outcomes
@@ -54,7 +54,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _plan(arguments: Namespace) -> Plan:
-    """What is asked for; ConfigError where options do not fit together."""
+    """Scope from options; ConfigError if they conflict."""
     from lab.paper.drives import QUICK, Plan
 
     if arguments.tables == "positions" and (arguments.plots or arguments.tensor):

@@ -1,4 +1,4 @@
-"""`python -m lab roads`: roads and what is lost on them."""
+"""`python -m lab roads`: roads and their losses."""
 
 from functools import partial
 

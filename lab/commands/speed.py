@@ -1,4 +1,4 @@
-"""`python -m lab speed`: how fast the parts are."""
+"""`python -m lab speed`: speed of the parts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ EXTRA = "lab"
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Options of the command: those of each load, which it declares itself."""
+    """Options of the command, declared by each load."""
     loads = f"what to measure, and its options: {', '.join(LOADS)}; `NAME --help` says more"
     parser.add_argument("load", nargs=REMAINDER, metavar="NAME ...", help=loads)
 

@@ -1,1 +1,1 @@
-"""The map fed back: what machines gain that find their lane on the map that all of them drew, and what may harm."""
+"""The map fed back: benefit of localisation on the fleet's lanes, and possible harm."""

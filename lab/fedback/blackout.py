@@ -1,4 +1,4 @@
-"""Machines that lose GPS, in the whole filter: how far they are off with the lanes of another day, and without."""
+"""Machines that lose GPS, in the full filter: errors with another day's lanes, and without."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from sim.recorder import TRACKS_FOLDER
 from sitegrid.proof.figures import Row, rounded
 from sitegrid.proof.tracks import read_track
 
-LOST_S, LASTS_S = 110.0, 300.0  # after the first reading; for how long
-AT_S = (60.0, 300.0)  # of it, when errors are judged
-INSIDE = 5.991  # normalised error squared of the 95 % ellipse
+LOST_S, LASTS_S = 110.0, 300.0  # start after the first reading; duration
+AT_S = (60.0, 300.0)  # after the loss, when errors are judged
+INSIDE = 5.991  # normalised squared error at the 95 % ellipse
 
 
 @dataclass(frozen=True)
 class Lost:
-    """A machine without GPS for a while. other: seed of the day whose lanes it has, -1 for none."""
+    """A machine without GPS for a while. other: seed of the day of its lanes, -1: none."""
 
     machine: str
     other: int = -1
 
     @property
     def name(self) -> str:
-        """For files."""
+        """Name for files."""
         return f"{self.machine}-lost-{self.other}"
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors (n, 2) and covariances (n, 2, 2) of the live pose, a second apart.
+    """Errors (n, 2) and covariances (n, 2, 2) of the live pose, once a second.
 
-    after_s (n,): since GPS was lost. true_m (n, 2): where the machine was.
+    after_s (n,): since GPS was lost. true_m (n, 2): true position.
     """
 
     after_s: Floats
@@ -66,14 +66,14 @@ EXPERIMENT = Experiment("blackout", Errors, solve)
 
 
 def lanes_of(seed: int, seconds: float, cache: Path) -> LaneMap:
-    """Lanes of the day before, whose nodes are there already."""
+    """Lanes of an earlier day with existing nodes."""
     drive = day("driven", seed, seconds)
     files = {name: NODES.file(replay_task(Machine(name), drive), cache) for name in drive.names}
     return lane_map(days_ago([(name, read_result(Nodes, file).rows) for name, file in files.items()], 1))
 
 
 def localise(folder: Path, name: str, lanes: LaneMap | None) -> Errors:
-    """Errors of a machine that has these lanes from the begin, and loses GPS."""
+    """Errors of a machine with these lanes from the start, and GPS lost later."""
     log = open_log(folder / "logs" / name)
     config = LocalisationConfig(map_aid="auto" if lanes else "off")
     core = Positioning(log.site, with_receivers(log.machine, 2), PipelineConfig(localisation=config))
@@ -96,11 +96,11 @@ def localise(folder: Path, name: str, lanes: LaneMap | None) -> Errors:
     return Errors(after_s, off_m, covariance_m2, true_m)
 
 
-Courses = Mapping[bool, Sequence[Errors]]  # with lanes, and without
+Courses = Mapping[bool, Sequence[Errors]]  # with lanes, without
 
 
 def courses_of(runner: Runner, turns: Sequence[tuple[int, int]], seconds: float) -> Courses:
-    """All machines of the second day of each turn, with lanes of the first, and without."""
+    """All machines of each turn's second day, with the first day's lanes and without."""
     courses: dict[bool, list[Errors]] = {}
     for aided in (True, False):
         drives = [(first, day("driven", second, seconds)) for first, second in turns]
@@ -110,7 +110,7 @@ def courses_of(runner: Runner, turns: Sequence[tuple[int, int]], seconds: float)
 
 
 def row_of(after_s: float, courses: Courses) -> Row:
-    """Errors so long after GPS was lost."""
+    """Errors at a time after the loss of GPS."""
     row: Row = {"case": f"driven-lost-{after_s:g}s", "courses": len(courses[True])}
     for aided, ending in ((True, ""), (False, "_without")):
         at = [int(np.argmin(np.abs(course.after_s - after_s))) for course in courses[aided]]

@@ -1,4 +1,4 @@
-"""Days on a site: which ways machines drive, from lanes that repeat to driving that never does."""
+"""Days on a site: machine routes from repeated lanes to free driving."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from lab.campaign.recordings import PlannedDrive, Setup, toml_of
 from sim.operators.routes import Corners
 
 OUTER: Corners = ((20, 16), (180, 16), (184, 130), (100, 134), (16, 130))
-APART_M = 6.0  # between the two lanes of the case `two`
-FREE_CORNERS = 8  # of a machine's way on a day of free driving
+APART_M = 6.0  # between the two lanes of case `two`
+FREE_CORNERS = 8  # of a machine's route on a day of free driving
 ROUNDING_M = 8.0
-CROSSED_RAD = (0.0, 0.7, 1.57, 2.4)  # how rectangles lie that all cross each other
-CROSSED_M = (52.0, 18.0)  # half of their sides
+CROSSED_RAD = (0.0, 0.7, 1.57, 2.4)  # angles of rectangles that all cross each other
+CROSSED_M = (52.0, 18.0)  # half their sides
 
 
 @dataclass(frozen=True)
 class Site:
-    """A site of four machines. base: scenario. model, preset, speed: of its machines. fixed: whether days repeat."""
+    """A site of four machines. base: scenario. model, preset, speed: of its machines. fixed: days repeat."""
 
     name: str
     base: str
@@ -53,19 +53,19 @@ class Day(PlannedDrive):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of its machines."""
+        """Machine names."""
         return tuple(f"machine-{i + 1}" for i in range(self.machines))
 
     @property
     def scenario_toml(self) -> str:
-        """The scenario file of this day."""
+        """Scenario file."""
         site = SITES[self.site]
         ways = _ways(self.site, self.seed)
         top: dict[str, Any] = {"base": site.base, "world": self.setup.world}
         fleet = {"name": "machine", "model": site.model, "count": self.machines, "preset": site.preset}
         fleet |= {"drive_mps": site.drive_mps, "gps": (1, 2), "imu": (3,)}
         fleet |= {"routes": site.routes or tuple(ways), "other_way": self.site == "both"}
-        if ways:  # who waits for whom is not what these days are about
+        if ways:  # giving way is not under test
             top["give_way"] = False
         routes = [
             f"[[route]]\n{toml_of({'name': name, 'corners': corners, 'rounding_m': ROUNDING_M})}"
@@ -81,7 +81,7 @@ def day(site: str, seed: int, seconds: float, world: str | None = "fast") -> Day
 
 
 def _ways(site: str, seed: int) -> dict[str, Corners]:
-    """Ways of the machines where the scenario's own are not driven."""
+    """Machine routes that replace the scenario's."""
     if site == "free":
         return free_ways(seed)
     if site == "crossings":
@@ -92,13 +92,13 @@ def _ways(site: str, seed: int) -> dict[str, Corners]:
 
 
 def free_ways(seed: int) -> dict[str, Corners]:
-    """Ways of four machines that nobody drives twice."""
+    """Four routes that are never repeated."""
     draw = np.random.default_rng(seed)
     return {f"free-{i}": _free(draw) for i in range(4)}
 
 
 def _within(corners: Corners, by_m: float) -> Corners:
-    """A rectangle's corners moved inwards by the same distance on each side."""
+    """A rectangle's corners moved inwards equally on each side."""
     x, y = np.array(corners).T
     toward = np.stack([np.sign(x.mean() - x), np.sign(y.mean() - y)], axis=1)
     toward[np.abs(x - x.mean()) < 10, 0] = 0.0
@@ -112,7 +112,7 @@ def _rectangle(turned_rad: float) -> Corners:
 
 
 def _free(draw: np.random.Generator) -> Corners:
-    """A closed way around a place anywhere, either way round, as near and as far as it happens."""
+    """Random closed route, in either direction."""
     turn = np.linspace(0, 2 * np.pi, FREE_CORNERS, endpoint=False) * draw.choice((-1, 1)) + draw.uniform(0, 2 * np.pi)
     middle, share = (draw.uniform(75, 125), draw.uniform(65, 85)), draw.uniform(0.6, 1.0, FREE_CORNERS)
     x, y = middle[0] + 55 * share * np.cos(turn), middle[1] + 47 * share * np.sin(turn)

@@ -1,4 +1,4 @@
-"""The second day on the map of the first, both ways round, against the same drives without a map."""
+"""The second day on the first day's map and vice versa, against the same drives without a map."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from protocol.arrays import Floats
 from protocol.errors import ConfigError
 from sitegrid.proof.figures import Report, Row, rounded
 
-SETTLED_S = 60.0  # judged is what comes after
+SETTLED_S = 60.0  # judged afterwards
 REPEATED = ("loading", "haul", "two", "both", "crossings", "free")
 
 
 @dataclass(frozen=True)
 class FedbackCase:
-    """A site of `days`, a map of `maps`, and how many receivers count.
+    """A site of `days`, a map of `maps`, and the number of receivers used.
 
-    map: also `row`, each day on those before it; or `lost`, machines that lose GPS.
+    map: or `row`: each day on all days before; or `lost`: machines lose GPS.
     """
 
     site: str
@@ -40,7 +40,7 @@ class FedbackCase:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name for people."""
         return f"{self.site}-{self.map}" + "-1gps" * (self.receivers == 1)
 
 
@@ -58,9 +58,9 @@ Figures = Mapping[str, Floats]  # by machine
 def run(
     runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[FedbackCase] = CASES
 ) -> tuple[Report, Courses]:
-    """Record, localise once, and filter again with each map; a row per case, and courses without GPS.
+    """Record, localise once, filter again with each map; a row per case, and courses without GPS.
 
-    Seeds count in pairs.
+    Seeds are used in pairs.
     """
     pairs = list(pairwise(seeds))[::2]
     if not pairs:
@@ -87,7 +87,7 @@ def run(
 def _days(
     runner: Runner, cases: Sequence[FedbackCase], seeds: Sequence[int], seconds: float
 ) -> Mapping[tuple[str, int], Mapping[int, Drives]]:
-    """The drives of each site and number of receivers, by seed."""
+    """Drives by site and receivers, then seed."""
     drives = {(case.site, case.receivers, seed): day(case.site, seed, seconds) for case in cases for seed in seeds}
     keys = [(*key, name) for key, drive in drives.items() for name in drive.names]
     tasks = [replay_task(Machine(name, count), drives[site, count, seed]) for site, count, seed, name in keys]
@@ -102,9 +102,9 @@ def _rows(drives: Drives) -> Rows:
 
 
 def figures_of_day(case: FedbackCase, first: Drives, second: Drives, seconds: float) -> tuple[Figures, Counter[str]]:
-    """Figures of the machines of the second day, with the map and without, and what became of windows.
+    """Figures of the second day's machines with and without map, and counts of windows.
 
-    A map that grows is of places that it aided itself: filtered again as often as it is read, these are all there.
+    A growing map contains positions that it aided; as many reruns as reads include all of these.
     """
     rows, own, young = days_ago(_rows(first), 1), _rows(second), case.map in GROWING
     begin_ns = int(min(nodes.stamp_ns[0] for nodes in second.values()))
@@ -125,9 +125,9 @@ def _compared(drives: Drives, without: Mapping[str, Course], aided: Mapping[str,
 
 
 def _row_of_days(days: Sequence[Drives]) -> list[Row]:
-    """Each day on the map of all days before it, whose places lanes aided too; a row per day from the second on.
+    """Each day on the map of all earlier days, themselves aided by lanes; a row per day from the second.
 
-    offset_m: how far the samples of all machines of a day are off together, which is what a map could run away by.
+    offset_m: mean error of all machines of a day, the direction in which a map could run away.
     """
     known: list[tuple[str, Any]] = []
     out: list[Row] = []
@@ -154,7 +154,7 @@ def _row_of_days(days: Sequence[Drives]) -> list[Row]:
 
 
 def _figures(nodes: Nodes, course: Course, named: str = "") -> dict[str, float]:
-    """Mean squared errors [m2] and shares inside the 95 % ellipse, once the filter has settled."""
+    """Mean squared errors [m2] and shares inside the 95 % ellipse, after settling."""
     settled = nodes.stamp_ns - nodes.stamp_ns[0] >= SETTLED_S * 1e9
     out: dict[str, float] = {}
     for what, off_m, P in (
@@ -171,7 +171,7 @@ def _figures(nodes: Nodes, course: Course, named: str = "") -> dict[str, float]:
 
 
 def _row(case: FedbackCase, days: Sequence[Figures], counts: Sequence[Counter[str]]) -> Row:
-    """Errors pooled over days and machines; ratios to those without a map: of all, 95th percentile, worst, by day."""
+    """Errors pooled over days and machines; ratios to those without map: overall, 95th percentile, worst, by day."""
     row: Row = {"case": case.name, "days": len(days)}
     for what in ("live", "smoothed"):
         aided, without = (np.array([figures[f"{name}{what}_m2"] for figures in days]) for name in ("", "without_"))

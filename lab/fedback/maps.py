@@ -1,4 +1,4 @@
-"""Lane maps by the map server's own fold and layer, and maps that may harm: lanes elsewhere, and none that repeat."""
+"""Lane maps by the map server's own fold and layer, and harmful ones: displaced lanes, unrepeated lanes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MapsOf = Callable[[str], Maps]  # of a machine
 
 
 def lane_map(rows: Iterable[tuple[str, Table]]) -> LaneMap:
-    """Lanes as the server makes them of samples."""
+    """The server's lanes from samples."""
     grid, config = Grid(1.0, FoldConfig()), ServerConfig()
     for name, table in rows:
         grid.fold(table, name)
@@ -37,7 +37,7 @@ def lane_map(rows: Iterable[tuple[str, Table]]) -> LaneMap:
 
 
 def moved(rows: Rows, left_m: float = 0.0, east_m: float = 0.0, from_x_m: float = -1e9) -> Rows:
-    """Samples moved to the left of where machines drove, and east; left: beyond a place east, over 10 m less."""
+    """Samples moved left of their heading, and east; left only beyond from_x_m, fading in over 10 m."""
     out = []
     for name, table in rows:
         table, heading = table.copy(), table["heading_rad"].astype(float)
@@ -51,7 +51,7 @@ def moved(rows: Rows, left_m: float = 0.0, east_m: float = 0.0, from_x_m: float 
 
 
 def turned(rows: Rows) -> Rows:
-    """The same ways, driven in the opposite direction by others."""
+    """The same routes driven in the opposite direction by others."""
     out = []
     for name, table in rows:
         table = table.copy()
@@ -61,7 +61,7 @@ def turned(rows: Rows) -> Rows:
 
 
 def days_ago(rows: Rows, days: int) -> Rows:
-    """The same, so many days earlier: recordings of all days begin at one stamp."""
+    """The same on an earlier day: all recordings start at one stamp."""
     out = []
     for name, table in rows:
         table = table.copy()
@@ -76,7 +76,7 @@ def renamed(rows: Rows, ending: str) -> Rows:
 
 
 def along(lines: Iterable[Floats], stamp_ns: int, draw: np.random.Generator, spacing_m: float = 0.5) -> Rows:
-    """Samples along lines (k, 2) of points spacing_m apart, each by a machine that errs by a metre, slowly."""
+    """Samples along lines (k, 2), points spacing_m apart, each by a machine with slow 1 m errors."""
     out = []
     for number, line in enumerate(lines):
         rows = empty(len(line))
@@ -102,14 +102,14 @@ def crossing(count: int, draw: np.random.Generator) -> list[Floats]:
 
 
 def free(seed: int, laps: int = 2) -> list[Floats]:
-    """Ways of a day of free driving."""
+    """Lines of a day of free driving."""
     ways = (tour(corners, 8.0).legs[0] for corners in free_ways(seed).values())
     return [np.tile(leg.points, (laps, 1)) for leg in ways]
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What maps are made of. rows: of another day; own: of the day that is judged, both by machine. begin_ns: of it."""
+    """Input of maps. rows: another day; own: the judged day, both by machine; begin_ns: its start."""
 
     rows: Rows
     own: Rows
@@ -117,18 +117,18 @@ class Scene:
     seconds: float
 
     def still(self, rows: Rows) -> MapsOf:
-        """One map for all."""
+        """One fixed map."""
         lanes = lane_map(rows)
         return lambda _: lambda __: lanes
 
     def moves(self, left_m: float) -> MapsOf:
-        """Roads of the eastern half lie elsewhere from half time on, seen from the map: as if they had been moved."""
+        """Roads of the eastern half seem displaced from half time on."""
         before, after = lane_map(self.rows), lane_map(moved(self.rows, left_m, from_x_m=EAST_M))
         half_ns = self.begin_ns + round(self.seconds / 2 * 1e9)
         return lambda _: lambda stamp_ns: before if stamp_ns < half_ns else after
 
     def grows(self, names: Callable[[str], Sequence[str]]) -> MapsOf:
-        """The map of the same day from nothing, of the machines that a machine's name gives, read now and then."""
+        """Map of the same day from nothing, by the machines in names(machine), read periodically."""
         kept: dict[tuple[Sequence[str], int], LaneMap | None] = {}
 
         def maps_of(name: str) -> Maps:
@@ -147,7 +147,7 @@ class Scene:
 
 
 EAST_M = 100.0
-READ_S, LATE_S = 180.0, 95.0  # how often lanes are asked for, and how much later samples are final
+READ_S, LATE_S = 180.0, 95.0  # reading interval of lanes; delay until samples are final
 GROWING = ("young", "alone")  # maps of the same day
 _draw = partial(np.random.default_rng, 7)
 MAPS: dict[str, Callable[[Scene], MapsOf]] = {

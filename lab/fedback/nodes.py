@@ -1,13 +1,13 @@
-"""A drive as the project's own filter saw it, kept so that it can be filtered again with other measurements.
+"""A drive as summed up by our filter, so that it can be filtered again with more measurements.
 
-Between two nodes, a second apart, the smoother sums up what readings said (`agents/localisation/filters/smoother.py`):
-Phi, the adjoint a and the information I, of which P is the covariance at the first node. So the error xi of node k is
+Between nodes, a second apart, the smoother sums readings (`agents/localisation/filters/smoother.py`): Phi, the adjoint
+a, the information I; P is the covariance at the first node. The error xi of node k is
 
     seen by the readings up to node k + 1 with information J = I (1 - P I)^-1 and vector j = (1 - I P)^-1 a
     xi_{k+1} = A (xi_k - P a) + w,  w ~ N(0, W)     A = Phi (1 - P I)^-1,  W = P_{k+1} - A (P - P I P) A^T
 
-and the filter runs again with more measurements at nodes in a thirtieth of its time, exact to first order. It does not
-hold without GPS, where the filter's gains are not optimal on purpose (`considers`).
+A rerun with more measurements at nodes takes a thirtieth of the time and is exact to first order. It does not hold
+without GPS, where the gains are deliberately suboptimal (`considers`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from protocol.machine.samples import empty
 from sim.recorder import TRACKS_FOLDER
 from sitegrid.proof.tracks import read_track
 
-EVERY_M = 0.5  # from one sample to the next
+EVERY_M = 0.5  # sample spacing
 TAKEN = 10  # readings at a time: some hundredths of a second
 
 
@@ -38,11 +38,11 @@ Segments = tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats]  # x, P
 
 @dataclass(frozen=True)
 class Nodes:
-    """What was believed at n nodes, and what the readings up to the next one say.
+    """Beliefs at n nodes, and the information of the readings between them.
 
-    stamp_ns: (n,). x: (n, s), P: (n, s, s). A, W, J: (n - 1, s, s), j, shift: (n - 1, s), shift is P a. true_m: (n, 2),
-    where the machine was. way_ns: (k,), way: (k, 4) by dead reckoning, x, y [m], angle [rad], distance [m]. rows: final
-    samples, of places alone. ahead_m: of the load centre.
+    stamp_ns: (n,). x: (n, s), P: (n, s, s). A, W, J: (n - 1, s, s), j, shift: (n - 1, s), shift = P a. true_m: (n, 2),
+    true position. way_ns: (k,), way: (k, 4) by dead reckoning, x, y [m], angle [rad], distance [m]. rows: final
+    samples, positions only. ahead_m: of the load centre.
     """
 
     stamp_ns: Ints
@@ -62,19 +62,19 @@ class Nodes:
 
 @dataclass(frozen=True)
 class Machine:
-    """One machine of a day, and how many of its receivers count."""
+    """One machine of a day, and its number of receivers used."""
 
     machine: str
     receivers: int = 2
 
     @property
     def name(self) -> str:
-        """For people and for files."""
+        """Name for people and files."""
         return f"{self.machine}-{self.receivers}gps"
 
 
 def solve(task: Task[Machine], cache: Path) -> Nodes:
-    """The nodes of one machine's drive."""
+    """Nodes of one machine's drive."""
     assert task.drive
     return watch(task.drive.folder(cache), task.variant)
 
@@ -83,7 +83,7 @@ EXPERIMENT = Experiment("fedback", Nodes, solve)
 
 
 class _Watched:
-    """A filter that notes the belief at the end of each second."""
+    """A filter that records its belief at the end of each second."""
 
     def __init__(self, engine: Filter) -> None:
         self.engine = engine
@@ -99,14 +99,14 @@ class _Watched:
 
 
 def with_receivers(machine: MachineConfig, count: int) -> MachineConfig:
-    """The machine, of whose GPS receivers only the first count."""
+    """The machine with only its first `count` GPS receivers."""
     gps = [sensor.name for sensor in machine.sensors if sensor.kind == "gps"]
     sensors = (replace(s, use=s.use and s.name not in gps[count:]) for s in machine.sensors)
     return replace(machine, sensors=tuple(sensors))
 
 
 def watch(folder: Path, who: Machine) -> Nodes:
-    """Localise one machine of a recording, and note the filter's nodes."""
+    """Localise one machine of a recording and record the filter's nodes."""
     name = who.machine
     log = open_log(folder / "logs" / name)
     core = Positioning(log.site, with_receivers(log.machine, who.receivers), PipelineConfig())
@@ -132,7 +132,7 @@ def watch(folder: Path, who: Machine) -> Nodes:
 
 
 def _samples(way: Floats, poses: dict[int, PoseBelief], smoothed: list[SmoothedPose], ahead_m: float) -> Table:
-    """A sample of the place alone for each EVERY_M driven, where the smoother has the machine."""
+    """Smoothed position samples, one per EVERY_M driven."""
     step = np.floor(way[:, 4] / EVERY_M)
     at = np.flatnonzero(np.diff(step, prepend=step[:1]) > 0)
     stamps = np.array(sorted(poses))
@@ -152,7 +152,7 @@ def _samples(way: Floats, poses: dict[int, PoseBelief], smoothed: list[SmoothedP
 
 
 def _segments(beliefs: list[Belief]) -> tuple[Ints, Segments]:
-    """Stamps, and the columns of `Nodes` that the filter gives."""
+    """Stamps, and the filter's columns of `Nodes`."""
     stamps = np.array([belief.stamp_ns for belief in beliefs], np.int64)
     x, P = np.array([belief.x for belief in beliefs]), np.array([belief.P for belief in beliefs])
     pasts = [belief.past for belief in beliefs[1:]]

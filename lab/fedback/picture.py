@@ -1,4 +1,4 @@
-"""A picture: a machine without GPS, whose ellipse shrinks in each bend as it finds its lane."""
+"""Picture of a machine without GPS: its ellipse shrinks at each bend that matches a lane."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from lab.fedback.blackout import INSIDE, LASTS_S, Errors
 from protocol.arrays import Floats
 from protocol.site.geometry import BLOCK_CELLS
 
-SIGMAS_95 = math.sqrt(INSIDE)  # half axes of the 95 % ellipse
-EVERY_S = 20  # an ellipse so often
-MARGIN_M, DARK_M = 12.0, 4.0  # around the way; metres driven that are drawn black
+SIGMAS_95 = math.sqrt(INSIDE)  # semi-axes of the 95 % ellipse
+EVERY_S = 20  # between ellipses
+MARGIN_M, DARK_M = 12.0, 4.0  # around the route; metres driven that are drawn black
 WITH, WITHOUT = "#0072b2", "#d55e00"
 
 
 def draw(lanes: LaneMap, aided: Errors, without: Errors, file: Path) -> None:
-    """Draw where a machine believes to be without GPS, and how large its ellipse is."""
+    """Draw the estimated track without GPS and its ellipses."""
     figure, (plan, sizes) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(1, 1), layout="constrained")
     _draw_lanes(plan, lanes)
     for course, colour, label in ((without, WITHOUT, "without lanes"), (aided, WITH, "on the fleet's lanes")):

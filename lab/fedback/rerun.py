@@ -1,4 +1,4 @@
-"""The filter run again from its nodes, with windows of lanes as measurements; live, and smoothed with a lag."""
+"""Rerun the filter from its nodes with lane windows as measurements; live, and smoothed with a lag."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from lab.fedback.nodes import Nodes
 from protocol.arrays import Floats, Table
 
 LAG = 90  # nodes
-Maps = Callable[[int], LaneMap | None]  # the map that an agent has at a stamp
+Maps = Callable[[int], LaneMap | None]  # an agent's map at a stamp
 
 
 @dataclass(frozen=True)
 class Course:
-    """Errors (n, 2) and covariances (n, 2, 2) at the nodes, live and smoothed; counts: what became of windows.
+    """Errors (n, 2) and covariances (n, 2, 2) at nodes, live and smoothed; counts: outcomes of windows.
 
-    shares (n,): how much of the smoothed places came from lanes.
+    shares (n,): part of the smoothed position that came from lanes.
     """
 
     live_m: Floats
@@ -41,10 +41,10 @@ class Course:
 
 
 class _Smoother:
-    """Nodes of the lag, jointly with the state: mean (q, 3), covariance (q, 3, 3), cross-covariance (q, 3, s)."""
+    """Nodes in the lag, joint with the state: mean (q, 3), covariance (q, 3, 3), cross-covariance (q, 3, s)."""
 
     def __init__(self, states: int, offset_m2: float) -> None:
-        """offset_m2: prior variance of the map's offset, 0 where that is no state; held: least share of places."""
+        """offset_m2: prior variance of the map's offset, 0: not a state; held: least share of positions."""
         self.mean, self.P, self.C = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, states))
         self.final: list[tuple[Floats, Floats, float]] = []
         self.offset_m2, self.held = offset_m2, 0.0
@@ -58,13 +58,13 @@ class _Smoother:
         self.C = np.concatenate([self.C[keep], P[None, KEPT]])
 
     def inform(self, vector: Floats, information: Floats, moved: Floats) -> None:
-        """By a vector (s,) and information (s, s) on the state, which moves (s, s) then."""
+        """Apply information (s, s) and vector (s,) on the state, which then moves by (s, s)."""
         self.mean = self.mean + self.C @ vector
         self.P = self.P - self.C @ information @ self.C.transpose(0, 2, 1)
         self.C = self.C @ moved.T
 
     def all(self) -> tuple[Floats, Floats, Floats]:
-        """Places (n, 2), covariances (n, 2, 2) and shares (n,) of all nodes so far."""
+        """Positions (n, 2), covariances (n, 2, 2), shares (n,) of all nodes so far."""
         shares = map(self._share, self.C)
         means, covariances, aided = zip(*self.final, *zip(self.mean, self.P, shares, strict=True), strict=True)
         return np.array(means)[:, :2], np.array(covariances)[:, :2, :2], np.array(aided)
@@ -74,7 +74,7 @@ class _Smoother:
 
 
 def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -> Course:
-    """The filter again. aids: False for the filter as it was."""
+    """Rerun the filter. aids: False: the original filter."""
     n = nodes.x.shape[1]
     states = n + 3 * aids
     window, guards, counts = Window(nodes.ahead_m), Guards(), Counter[str]()
@@ -122,7 +122,7 @@ def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -
 
 
 def placed_again(nodes: Nodes, without: Course, aided: Course) -> Table:
-    """The samples of a drive, where lanes put them, with what came from lanes; without: the same drive without."""
+    """A drive's samples at lane-aided positions, with the lanes' share; without: the rerun without lanes."""
     rows, moved_m = nodes.rows.copy(), aided.smoothed_m - without.smoothed_m
     for axis, name in enumerate(("x_m", "y_m")):
         rows[name] += np.interp(rows["stamp_ns"], nodes.stamp_ns, moved_m[:, axis])
@@ -134,7 +134,7 @@ def placed_again(nodes: Nodes, without: Course, aided: Course) -> Table:
 
 
 def _reckoned(nodes: Nodes, stamp_ns: int) -> DeadReckonedPose:
-    """Where dead reckoning was at a stamp."""
+    """Dead reckoning at a stamp."""
     x_m, y_m, angle_rad = (float(np.interp(stamp_ns, nodes.way_ns, nodes.way[:, i])) for i in range(3))
     return DeadReckonedPose(stamp_ns, 0.0, angle_rad, x_m, y_m)
 
@@ -142,7 +142,7 @@ def _reckoned(nodes: Nodes, stamp_ns: int) -> DeadReckonedPose:
 def _matched(
     matched: Match, x: Floats, d: Floats, P: Floats, H: Floats, smoother: _Smoother
 ) -> tuple[Floats, Floats, float]:
-    """After a match, and its normalised innovation squared."""
+    """Update by a match; also its normalised squared innovation."""
     y, S, R = matched.place_m - H @ x, H @ P @ H.T + matched.covariance_m2, matched.covariance_m2
     gain = np.linalg.solve(S, H)
     K = P @ gain.T
@@ -152,7 +152,7 @@ def _matched(
 
 
 def _moved(nodes: Nodes, k: int, d: Floats, P: Floats, smoother: _Smoother) -> tuple[Floats, Floats]:
-    """From node k to the next."""
+    """Propagate from node k to the next."""
     n, states = nodes.x.shape[1], len(d)
     A, W, J, j, shift = np.eye(states), np.zeros_like(P), np.zeros_like(P), np.zeros(states), np.zeros(states)
     A[:n, :n], W[:n, :n], J[:n, :n] = nodes.A[k], nodes.W[k], nodes.J[k]

@@ -1,1 +1,1 @@
-"""How right the estimate of the ground is, along the way of one machine."""
+"""Accuracy of ground estimation along one machine's track."""

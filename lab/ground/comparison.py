@@ -1,7 +1,7 @@
-"""Samples against the truth, at the places where the machine truly was.
+"""Samples against the truth at the machine's true places.
 
-Where localisation put a sample does not matter here: its stamp says where the machine was. The lag is how long the
-estimate takes to notice that the ground has changed.
+Localisation errors do not matter here: a sample's stamp gives the true place. Lag: delay of the estimate after a change
+of ground.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from sitegrid.proof.tracks import LoadTrack
 
 C_RR = np.array([zone.c_rr for zone in ZONES])
 FLAT_SLOPE = math.tan(math.radians(2.0))
-EDGE_M, EDGE_DEG = 2.0, 0.5  # at the edge of a ramp the gradient changes by more than this, this far around
-LEAST_RUN_M = 4.0  # a zone that is left sooner gives the estimate no time to settle
+EDGE_M, EDGE_DEG = 2.0, 0.5  # a ramp edge changes the gradient by more than this within this distance
+LEAST_RUN_M = 4.0  # shorter zones leave the estimate no time to settle
 LEAST_STEP = 0.01  # of c_rr; below it noise decides
-BEFORE_M = 2.0  # the front wheels cross a border before the load centre does, half a wheelbase of 1.5 m and a sample
-STEP_NS = 10_000_000  # in which the true track is searched for borders
+BEFORE_M = 2.0  # front wheels cross a border before the load centre: half a wheelbase, 1.5 m, plus a sample
+STEP_NS = 10_000_000  # resolution of the border search
 
 
 @dataclass(frozen=True)
 class PlacedSamples:
-    """Samples (n,) at the places where the machine truly was.
+    """Samples (n,) at true places.
 
-    track: the truth at their stamps. zone: kind of ground. border_m: distance to another kind. slope: true gradient
-    without unevenness (n, 2). is_edge: whether that changes nearby.
+    track: truth at their stamps. zone: ground class. border_m: distance to another. slope: true gradient without
+    roughness (n, 2). is_edge: slope changes nearby.
     """
 
     samples: Table
@@ -44,22 +44,22 @@ class PlacedSamples:
 
     @property
     def c_rr(self) -> Floats:
-        """Estimates of rolling resistance (n,), NaN where there is none."""
+        """Rolling resistance estimates (n,), NaN: none."""
         return np.asarray(self.samples["c_rr"], np.float64)
 
     @property
     def c_rr_error(self) -> Floats:
-        """Estimate minus the value of the zone (n,)."""
+        """Estimate minus the zone's value (n,)."""
         return np.asarray(self.c_rr - C_RR[self.zone], np.float64)
 
     @property
     def normalised_error(self) -> Floats:
-        """The error over its stated standard deviation (n,)."""
+        """Error over stated standard deviation (n,)."""
         return self.c_rr_error / np.sqrt(np.asarray(self.samples["c_rr_var"], np.float64))
 
     @property
     def is_right(self) -> Bools:
-        """Whether the estimate is in the class of the zone (n,)."""
+        """Whether the class is right (n,)."""
         return np.asarray(resistance_class(self.c_rr) == resistance_class(C_RR[self.zone]), np.bool_)
 
     @property
@@ -70,10 +70,9 @@ class PlacedSamples:
 
 @dataclass(frozen=True)
 class CellMeans:
-    """Classes of the cells (k,) of one tour: by the mean of their samples, and true ones.
+    """Classes of one tour's cells (k,): by the mean of samples, and true.
 
-    A mean is weighted by the distance that each sample stands for; UNKNOWN where there is none. slope: true gradient
-    over the cell without unevenness (k, 2).
+    Means are weighted by distance; UNKNOWN without samples. slope: true gradient of the cell without roughness (k, 2).
     """
 
     estimated: Ints
@@ -86,7 +85,7 @@ class CellMeans:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Estimates against the truth, from which figures are made. lags: see `lags`."""
+    """Estimates against the truth. lags: see `lags`."""
 
     placed: PlacedSamples
     cells: CellMeans
@@ -94,14 +93,14 @@ class Comparison:
 
 
 def compare(samples: Table, track: LoadTrack, ground: TrueGround, lag_s: float, from_ns: int) -> Comparison:
-    """Compare the samples of one drive with the truth, from an instant on; lag_s: by which samples are dated back."""
+    """Compare one drive's samples with the truth from from_ns on; lag_s: by which samples are backdated."""
     placed = place(samples, track, ground, from_ns)
     changes = crossings(track, ground, from_ns)
     return Comparison(placed, cell_means(placed, ground), lags(samples, track, changes, lag_s))
 
 
 def pool(several: Sequence[Any]) -> Any:
-    """Arrays, or dataclasses of arrays, of several drives one after the other."""
+    """Concatenate arrays, or dataclasses of arrays, of several drives."""
     first = several[0]
     if isinstance(first, np.ndarray):
         return np.concatenate(several)
@@ -109,13 +108,13 @@ def pool(several: Sequence[Any]) -> Any:
 
 
 def is_flat(slope: Floats) -> Bools:
-    """Whether gradients (n, 2) are those of level ground (n,)."""
+    """Whether gradients (n, 2) are level (n,)."""
     flat: Bools = np.hypot(*slope.T) < FLAT_SLOPE
     return flat
 
 
 def place(samples: Table, track: LoadTrack, ground: TrueGround, from_ns: int = 0) -> PlacedSamples:
-    """Put samples where the machine truly was at their stamps; those beyond the known truth are excluded."""
+    """Samples at their true places; those outside the truth's time are dropped."""
     covered = (samples["stamp_ns"] >= max(from_ns, track.stamp_ns[0])) & (samples["stamp_ns"] <= track.stamp_ns[-1])
     samples = samples[covered]
     there = track.at(samples["stamp_ns"])
@@ -131,7 +130,7 @@ def place(samples: Table, track: LoadTrack, ground: TrueGround, from_ns: int = 0
 
 
 def cell_means(placed: PlacedSamples, ground: TrueGround) -> CellMeans:
-    """Means of the samples of each cell, and the truth at its centre."""
+    """Cell means of samples, and the truth at cell centres."""
     cell = np.floor(placed.track.place_m / CELL_M).astype(np.int64)
     unique, which = np.unique(cell, axis=0, return_inverse=True)
     column, row = unique.T
@@ -150,7 +149,7 @@ def cell_means(placed: PlacedSamples, ground: TrueGround) -> CellMeans:
 
 
 def grade_errors(placed: PlacedSamples) -> tuple[Floats, Floats]:
-    """Errors (n,) [deg] of the slope along the machine's true heading, and to its left."""
+    """Slope errors (n,) [deg] along the true heading and to its left."""
     true, estimated, ahead_rad = placed.track.gradient, placed.gradient, placed.track.yaw_rad
     left_rad = ahead_rad + np.pi / 2
     ahead, left = (slope_deg(estimated, yaw) - slope_deg(true, yaw) for yaw in (ahead_rad, left_rad))
@@ -164,7 +163,7 @@ def slope_deg(gradient: Floats, yaw_rad: Floats) -> Floats:
 
 
 def _edges(track: LoadTrack, ground: TrueGround, driven_m: Floats) -> Bools:
-    """Whether the slope changes around the points (n,) of the track."""
+    """Whether the slope changes near track points (n,)."""
     angles = np.degrees(np.arctan(ground.slope(track.place_m)))
     low = np.searchsorted(track.driven_m, driven_m - EDGE_M)
     high = np.searchsorted(track.driven_m, driven_m + EDGE_M, side="right")
@@ -173,7 +172,7 @@ def _edges(track: LoadTrack, ground: TrueGround, driven_m: Floats) -> Bools:
 
 
 def _means(values: Floats, weight: Floats, which: Ints, count: int) -> Floats:
-    """Weighted means of groups (count,), of the values that are finite; NaN of none."""
+    """Weighted means of finite values by group (count,); NaN if empty."""
     known = np.isfinite(values)
     total = np.bincount(which[known], weight[known], count)
     mean: Floats = np.full(count, np.nan)
@@ -186,7 +185,7 @@ def _means(values: Floats, weight: Floats, which: Ints, count: int) -> Floats:
 
 @dataclass(frozen=True)
 class Crossing:
-    """A change of zone: its instant, the distance driven so far, c_rr before and after, and when the next begins."""
+    """A zone change: stamp, distance so far, c_rr before and after, start of the next."""
 
     stamp_ns: int
     driven_m: float
@@ -196,7 +195,7 @@ class Crossing:
 
 
 def crossings(track: LoadTrack, ground: TrueGround, from_ns: int) -> list[Crossing]:
-    """Changes of zone under the load centre, from one that lasts to another that lasts."""
+    """Zone changes under the load centre between lasting zones."""
     fine = track.at(np.arange(max(from_ns, track.stamp_ns[0]), track.stamp_ns[-1] + 1, STEP_NS))
     zone = ground.zone(fine.place_m)
     first = np.concatenate([[0], np.flatnonzero(np.diff(zone)) + 1])
@@ -213,12 +212,11 @@ def crossings(track: LoadTrack, ground: TrueGround, from_ns: int) -> list[Crossi
 
 
 def lags(samples: Table, track: LoadTrack, changes: list[Crossing], lag_s: float) -> Floats:
-    """Lag of each change of zone (k, 3): time [s] and distance [m] until the estimate knew it, and its place error [m].
+    """Lag per zone change (k, 3): time [s] and distance [m] to detection, and place error [m].
 
-    A machine dates its samples back by lag_s, the time that a change of the ground takes to show; it knew them then.
-    The estimate knows the change once it is nearer to the new zone's value than to the old one's; infinite where it is
-    not before the next change. The place error is what remains after samples are dated back, positive beyond the
-    border. Changes before which the estimate was not near to the old value are excluded.
+    Samples are backdated by lag_s, the delay with which ground shows; they were known lag_s later. Detection: the
+    estimate is closer to the new zone's value; infinite if not before the next change. Place error: what remains after
+    backdating, positive beyond the border. Changes whose old value was not reached before are excluded.
     """
     samples = samples[np.isfinite(samples["c_rr"])]
     known = track.at(samples["stamp_ns"] + round(lag_s * 1e9))

@@ -1,7 +1,6 @@
-"""How well rolling resistance and gradient are estimated: loaders at work, every row on the same recordings.
+"""Accuracy of rolling resistance and gradient: working loaders, all rows on the same recordings.
 
-The whole pipeline makes samples of the readings of a recording. Those are kept; comparing them with the truth takes a
-moment and is done anew.
+Pipeline samples are cached; the comparison with the truth is quick and always repeated.
 """
 
 from __future__ import annotations
@@ -34,36 +33,36 @@ from sitegrid.proof.tracks import LoadTrack, read_load_track
 
 LOADING = Setup("loading", ("west", "east", "middle", "yard"), gps=(1, 2), imu=(3,))
 ESTIMATORS = ("kalman", "rls")
-# Preset of a row -> preset of the simulator, and whether the machine calibrates itself by its work.
+# Row's preset -> simulator preset, and whether the machine calibrates itself by its work.
 PRESETS = {"nominal": ("dgps", False), "calibrated": ("dgps", True), "harsh": ("harsh", True)}
-# Not judged, in any row: one work cycle, in which a loader takes up, carries and dumps a load and drives the same
-# ground both ways, which is what calibration needs. Runs that are shorter than 600 s settle for the same share of them.
+# Not judged: one work cycle (load, carry, dump, same ground both ways), which calibration needs. Runs under 600 s skip
+# the same share.
 SETTLE_S, SETTLE_SHARE = 240.0, 0.4
-CHUNK = 5000  # readings that the pipeline gets at a time
+CHUNK = 5000  # readings per pipeline step
 DIGITS = 3
 
 
 @dataclass(frozen=True)
 class GroundConfiguration:
-    """What one row of the table compares."""
+    """A row's configuration."""
 
     estimator: str
     preset: str
 
     @property
     def name(self) -> str:
-        """Short and unique."""
+        """Short unique name."""
         return f"{self.estimator}-{self.preset}"
 
     @property
     def options(self) -> PipelineConfig:
-        """The agent's."""
+        """The agent's options."""
         calibrate = PRESETS[self.preset][1]
         return PipelineConfig(estimation=EstimationConfig(estimator=self.estimator, calibrate=calibrate))
 
     @property
     def tuning(self) -> EstimationTuning:
-        """Of its estimators."""
+        """Estimator tuning."""
         return TUNING
 
 
@@ -73,7 +72,7 @@ GOALS = goals("ground")
 
 @dataclass(frozen=True)
 class PipelineOutput:
-    """What the pipeline made of a recording: samples, what it withheld by reason, and its processor time."""
+    """A recording's samples, withheld ones by reason, and CPU time."""
 
     samples: Table
     withheld: dict[str, int]
@@ -82,7 +81,7 @@ class PipelineOutput:
 
 @dataclass(frozen=True)
 class GroundOutcome:
-    """One row on one recording: what the pipeline made of it, and its comparison with the truth."""
+    """One row on one recording: output and comparison with the truth."""
 
     row: GroundConfiguration
     output: PipelineOutput
@@ -96,9 +95,9 @@ def run(
     rows: Sequence[GroundConfiguration] = ROWS,
     setup: Setup = LOADING,
 ) -> tuple[Report, list[GroundOutcome]]:
-    """Record, estimate and judge all rows with all seeds; a row per estimator and preset, and what the goals say."""
+    """Record, estimate and judge all rows and seeds; a row per estimator and preset, and the goals."""
     pairs = [(PlannedDrive(seed, seconds, PRESETS[row.preset][0], setup), row) for seed in seeds for row in rows]
-    pairs.sort(key=lambda pair: (pair[0].seed, pair[0].preset))  # a worker loads each recording once
+    pairs.sort(key=lambda pair: (pair[0].seed, pair[0].preset))  # each worker loads a recording once
     outputs = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
     outcomes = [judged(*pair, output, runner.cache) for pair, output in zip(pairs, outputs, strict=True)]
     table = [summarise(row, [outcome for outcome in outcomes if outcome.row == row]) for row in rows]
@@ -108,25 +107,25 @@ def run(
 
 
 def settle_s(seconds: float) -> float:
-    """How much of a run's beginning is not judged."""
+    """Unjudged start of a run."""
     return min(SETTLE_S, SETTLE_SHARE * seconds)
 
 
 def judged(drive: PlannedDrive, row: GroundConfiguration, output: PipelineOutput, cache: Path) -> GroundOutcome:
-    """Compare the samples of one row on one recording with the truth."""
+    """Compare one row's samples on one recording with the truth."""
     track, ground = _truth(drive, cache)
     from_ns = int(track.stamp_ns[0]) + round(settle_s(drive.seconds) * 1e9)
     return GroundOutcome(row, output, compare(output.samples, track, ground, LAG_S, from_ns))
 
 
-@lru_cache(maxsize=2)  # tasks come recording by recording
+@lru_cache(maxsize=2)  # tasks are grouped by recording
 def _truth(drive: PlannedDrive, cache: Path) -> tuple[LoadTrack, TrueGround]:
     track = read_load_track(track_file(drive.folder(cache)), drive.machine.load_centre_m)
     return track, true_ground(drive.scenario.ground, drive.seed)
 
 
 def summarise(row: GroundConfiguration, outcomes: Sequence[GroundOutcome]) -> Row:
-    """One row of the table: figures of all samples and cells together, with intervals over the seeds."""
+    """A table row: pooled figures with intervals over seeds."""
     by_seed = [figures(outcome.comparison) for outcome in outcomes]
     wrong_by_seed = [seed["wrong_cells_pct"] for seed in by_seed]
     pooled: Comparison = pool([outcome.comparison for outcome in outcomes])
@@ -151,7 +150,7 @@ def summarise(row: GroundConfiguration, outcomes: Sequence[GroundOutcome]) -> Ro
 
 
 def _interval(numbers: Sequence[float]) -> float | None:
-    """Half-width of the interval of the seeds that have a figure."""
+    """Half-width of the interval over seeds that have the figure."""
     return half_width(np.array([number for number in numbers if math.isfinite(number)]))
 
 
@@ -159,7 +158,6 @@ def _interval(numbers: Sequence[float]) -> float | None:
 
 
 def _estimate(task: Task[GroundConfiguration], cache: Path) -> PipelineOutput:
-    """Run one row on one recording."""
     recording = task.recording(cache)
     what, readings = task.variant, recording.readings
     pipeline = Pipeline(recording.site, recording.machine, what.options, tuning=what.tuning)

@@ -1,7 +1,4 @@
-"""The figures of ground estimation: how many classes are right, how large errors are, how long a change takes.
-
-lab/README.md explains each; NaN where nothing was to be judged.
-"""
+"""Figures of ground estimation: right classes, errors, lag. Explained in lab/README.md; NaN: nothing to judge."""
 
 from __future__ import annotations
 
@@ -16,13 +13,13 @@ from protocol.site.ground_classes import UNKNOWN, ZONES, wrong_percent
 from sitegrid.proof.figures import Row, root_mean_square
 from sitegrid.proof.map_score import by_border_distance
 
-INTERIOR_M = 2.0  # the load centre this far from a border has all wheels on one kind of ground
+INTERIOR_M = 2.0  # all wheels on one ground class if the load centre is this far from borders
 EVERY = slice(None)
 DIRT = tuple(i for i, zone in enumerate(ZONES) if "dirt" in zone.name)
 
 
 def figures(comparison: Comparison) -> Row:
-    """The figures of a comparison."""
+    """Figures of a comparison."""
     placed, cells = comparison.placed, comparison.cells
     known, inside = np.isfinite(placed.c_rr), placed.border_m > INTERIOR_M
     measured, interior = np.isfinite(placed.gradient).all(axis=1), cells.border_m > INTERIOR_M
@@ -53,7 +50,7 @@ def figures(comparison: Comparison) -> Row:
 
 
 def soils(cells: CellMeans) -> list[Row]:
-    """How many cells of each kind of ground are right, and what the others were taken for; of dirt, flat cells."""
+    """Right cells per ground class, and confusions; of dirt, flat cells only."""
     rows = []
     for i, zone in enumerate(ZONES):
         here = (cells.true == i) & (cells.estimated != UNKNOWN) & (is_flat(cells.slope) | (i not in DIRT))
@@ -65,7 +62,7 @@ def soils(cells: CellMeans) -> list[Row]:
 
 
 def c_rr_bias(placed: PlacedSamples) -> float:
-    """Mean error of c_rr on flat ground away from borders: what calibration should have removed."""
+    """Mean c_rr error on flat ground off borders: what calibration should remove."""
     judged = np.isfinite(placed.c_rr) & is_flat(placed.slope) & (placed.border_m > INTERIOR_M)
     return _finite(np.mean, placed.c_rr_error[judged])
 
@@ -77,7 +74,7 @@ def by_border(cells: CellMeans) -> list[Row]:
 
 
 def _wrong(cells: CellMeans, which: Bools | slice = EVERY) -> float:
-    """Share [%] of these cells that is in another class than the truth."""
+    """Share [%] of cells in the wrong class."""
     return wrong_percent(cells.estimated[which], cells.true[which])
 
 
@@ -86,6 +83,6 @@ def _share(flags: Bools) -> float:
 
 
 def _finite(figure: Callable[[AnyArray], AnyArray], values: AnyArray) -> float:
-    """A figure of values; NaN of nothing, or where it is infinite, as a median of which more than half are."""
+    """A figure; NaN if empty or infinite (a median with over half infinite)."""
     value = float(figure(values)) if len(values) else math.nan
     return value if math.isfinite(value) else math.nan

@@ -1,1 +1,1 @@
-"""How right merged maps are, by method and case."""
+"""Accuracy of merged maps by method and case."""

@@ -1,6 +1,6 @@
-"""The cases on which merges are compared: sites, machines and passes, as the paper's and harder.
+"""Cases for map merging: sites, machines, passes, as in the paper and harder.
 
-A site of 300 x 200 m has five zones. Machines sweep it in lanes 1 m apart, one pass along, the next across.
+A 300 x 200 m site has five zones; machines sweep it in 1 m lanes, passes alternating along and across.
 """
 
 from __future__ import annotations
@@ -19,20 +19,19 @@ CELL_M = 1.0
 DRY_CONCRETE, GRAVEL, DRY_DIRT, WET_DIRT, SAND = range(len(ZONES))
 C_RR: Floats = np.array([zone.c_rr for zone in ZONES])
 STEEP = math.tan(math.radians(15))
-# Gradient (east, north) [m/m] of each zone.
+# Gradient (east, north) [m/m] by zone.
 FLAT = ((0.0, 0.0),) * 5
 GENTLE = ((0.0, 0.0), (0.03, 0.0), (0.0, 0.05), (-0.06, 0.04), (0.08, -0.05))
 SLOPES = ((0.0, 0.0), (STEEP, 0.0), (0.0, STEEP), (-STEEP, 0.0), (0.0, -STEEP))
-PASSES_BEFORE = 4  # of `repaved`; the site is repaved while the last of them goes on
+PASSES_BEFORE = 4  # of `repaved`, which happens during the last
 
 
 @dataclass(frozen=True)
 class CaseMachine:
-    """One machine. The covariance that it states is right; its gain and its offset are not known to it.
+    """One machine. Its stated covariance is right; it does not know its gain and offset.
 
-    first: number of its first pass; even ones go along the site, odd ones across. std_m: of its position error, per
-    axis. gain: factor of its c_rr. offset_m: of its positions, east. parked: stands in the dry dirt and sends all the
-    time.
+    first: number of its first pass; even: along the site, odd: across. std_m: position error per axis. gain: factor of
+    c_rr. offset_m: of positions, east. parked: stands on dry dirt and sends.
     """
 
     passes: int = 1
@@ -45,10 +44,10 @@ class CaseMachine:
 
 @dataclass(frozen=True)
 class MapCase:
-    """What is driven, on what, and what of the map is judged.
+    """The drive, the ground, and the judged part of the map.
 
-    gradients: of the zones. passes_after: how many whole passes follow a repaving. width_m: of a road across wet
-    dirt, whose cells alone are judged. columns, rows: size of the site in cells.
+    gradients: by zone. passes_after: complete passes after repaving. width_m: of a road across wet dirt; only its cells
+    are judged. columns, rows: site size in cells.
     """
 
     kind: str
@@ -62,7 +61,7 @@ class MapCase:
 
     @property
     def title(self) -> str:
-        """Kind, and what tells variants of it apart."""
+        """Kind and variant."""
         parts = [self.kind]
         parts += [f"{self.passes_after} after"] if self.passes_after is not None else []
         parts += [f"{self.width_m} m"] if self.width_m is not None else []
@@ -70,16 +69,15 @@ class MapCase:
 
     @property
     def name(self) -> str:
-        """The title without blanks, for files."""
+        """The title for files."""
         return self.title.replace(", ", "-").replace(" ", "_")
 
 
 @dataclass(frozen=True)
 class Site:
-    """True ground by cells (rows, columns), row 0 in the south.
+    """True ground by cell (rows, columns), row 0 in the south.
 
-    c_rr; c_rr_later: once it is repaved, the same where it is not. gradient: (rows, columns, 2), east and north.
-    repaved, judged: which cells are.
+    c_rr, and c_rr_later after repaving. gradient: (rows, columns, 2), east and north. repaved, judged: masks.
     """
 
     c_rr: Floats
@@ -106,7 +104,7 @@ def build_site(case: MapCase) -> Site:
 
 
 def zones(columns: int, rows: int) -> Ints:
-    """Zone of each cell (rows, columns): two in the south, three in the north."""
+    """Zone by cell (rows, columns): two in the south, three in the north."""
     zone = np.full((rows, columns), DRY_CONCRETE)
     south, north = slice(0, rows // 2), slice(rows // 2, rows)
     zone[south, columns // 2 :] = DRY_DIRT
@@ -117,7 +115,7 @@ def zones(columns: int, rows: int) -> Ints:
 
 
 def parking_place(case: MapCase) -> tuple[float, float]:
-    """Where a machine is parked [m]: in the middle of the dry dirt, which a gain of 1.6 makes wet."""
+    """Parking place [m]: mid dry dirt, which a gain of 1.6 turns into wet."""
     return 0.75 * case.columns * CELL_M, 0.25 * case.rows * CELL_M
 
 
@@ -141,7 +139,7 @@ CASES = (
 
 
 def select(names: Sequence[str]) -> tuple[MapCase, ...]:
-    """The cases of these kinds, in the order of the table; none means all. Raises ConfigError."""
+    """Cases of these kinds in table order; none: all. ConfigError."""
     known = list(dict.fromkeys(case.kind for case in CASES))
     if unknown := [name for name in names if name not in known]:
         raise ConfigError("--cases", f"`{unknown[0][:40]}` is not known; known: {', '.join(known)}")

@@ -1,6 +1,6 @@
-"""How right the merged map is: every method on the same samples of every case, against the truth.
+"""Accuracy of merged maps: all methods on the same samples of every case.
 
-Figures are those of the cells that machines truly passed and that the case judges.
+Figures cover truly passed, judged cells.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from sitegrid.proof.figures import Report, Row, rounded
 
 SERVER = "soft_votes"
 RESISTANCE, GRADE = ("resistance",), ("grade_east", "grade_north")
-GRADE_TOLERANCE = 0.01  # [m/m]; a gradient vector that is off by more is wrong
-SHARE = 0.6  # of votes: cells that are surer than this should hardly ever be wrong
-NEAR_M = 4.0  # three standard deviations: what the stated positions of a parked machine reach
-DIGITS = 4  # one cell of the site is 0.0017 %
-# Of a map, in percent of cells; `seconds` is the processor time of the method.
+GRADE_TOLERANCE = 0.01  # [m/m]; larger gradient errors count as wrong
+SHARE = 0.6  # of votes: surer cells should hardly ever be wrong
+NEAR_M = 4.0  # three standard deviations: reach of a parked machine's stated positions
+DIGITS = 4  # one cell is 0.0017 %
+# Percent of cells; `seconds`: the method's CPU time.
 FIGURES = (
-    "wrong_pct",  # of the known cells
-    "known_pct",  # of the driven cells
-    "changed_wrong_pct",  # of the repaved zone
-    "unchanged_wrong_pct",  # of the rest
+    "wrong_pct",  # of known cells
+    "known_pct",  # of driven cells
+    "changed_wrong_pct",  # in the repaved zone
+    "unchanged_wrong_pct",  # elsewhere
     "near_wrong_pct",  # near a parked machine
-    "share60_wrong_pct",  # of the cells whose leading class has at least SHARE of the votes
-    "share60_cells_pct",  # how many those are
+    "share60_wrong_pct",  # of cells whose leading class has SHARE of the votes
+    "share60_cells_pct",  # their number
     "seconds",
 )
 GOALS = goals("maps")
@@ -50,7 +50,7 @@ Output = TypeVar("Output")
 
 @dataclass(frozen=True)
 class CaseResult:
-    """What came of a task. samples: sent; cells: judged; distrusted: machines that the server excluded.
+    """Result of a task. samples: sent. cells: judged. distrusted: excluded machines.
 
     methods: FIGURES by method.
     """
@@ -62,7 +62,7 @@ class CaseResult:
 
 
 def run(runner: Runner, seeds: Sequence[int], cases: Sequence[MapCase] = CASES) -> tuple[Report, list[CaseResult]]:
-    """Simulate, merge and judge all cases with all seeds."""
+    """Simulate, merge and judge all cases and seeds."""
     tasks = [Task(case, seed, driven_s(case)) for case in cases for seed in seeds]
     results = runner.run(EXPERIMENT, tasks)
     rows = []
@@ -73,15 +73,15 @@ def run(runner: Runner, seeds: Sequence[int], cases: Sequence[MapCase] = CASES) 
 
 
 def driven_s(case: MapCase) -> float:
-    """How long all machines of a case drive, one after the other."""
+    """Total driving time of all machines."""
     passes = sum(machine.passes for machine in case.machines if not machine.parked)
     return passes * case.columns * case.rows * CELL_M**2 / LANE_M / SPEED_MPS
 
 
 def summarise(case: MapCase, method: str, results: Sequence[CaseResult]) -> Row:
-    """One row of the table: medians over the seeds, and the best, the worst and every seed.
+    """A table row: medians over seeds, best, worst, and all seeds.
 
-    distrusted: with how many seeds the server excluded each machine; None of other methods.
+    distrusted: seeds in which the server excluded each machine; None for other methods.
     """
     by_seed = [result.methods[method] for result in results]
     wrong = [seed["wrong_pct"] for seed in by_seed if seed["wrong_pct"] is not None]
@@ -103,13 +103,13 @@ def summarise(case: MapCase, method: str, results: Sequence[CaseResult]) -> Row:
 
 
 def _median(values: Sequence[float | None]) -> float | None:
-    """Median of the values that are known."""
+    """Median of known values."""
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
 
 
 def figures(case: MapCase, scene: MapScene, layers: Layers, seconds: float | None = None) -> Row:
-    """FIGURES of a map; None where one does not apply or nothing was to be judged."""
+    """FIGURES of a map; None: inapplicable or nothing to judge."""
     judged = scene.driven & scene.site.judged
     estimated, true = classes(case, scene, layers)
 
@@ -130,7 +130,7 @@ def figures(case: MapCase, scene: MapScene, layers: Layers, seconds: float | Non
 
 
 def classes(case: MapCase, scene: MapScene, layers: Layers) -> tuple[Ints, Ints]:
-    """Class of each cell in a map and in truth (rows, columns); for gradients, 0 is right and 1 is off by too much."""
+    """Class by cell in map and truth (rows, columns); for gradients 0: right, 1: wrong."""
     if not case.judges_grade:
         return resistance_class(layers["resistance"]), resistance_class(scene.site.c_rr_later)
     east, north = np.moveaxis(scene.site.gradient, -1, 0)
@@ -140,7 +140,7 @@ def classes(case: MapCase, scene: MapScene, layers: Layers) -> tuple[Ints, Ints]
 
 
 def near_parked(case: MapCase) -> Bools:
-    """Cells (rows, columns) that the stated positions of parked machines reach."""
+    """Cells (rows, columns) reached by parked machines' stated positions."""
     near: Bools = np.zeros((case.rows, case.columns), np.bool_)
     x_m, y_m = ((np.arange(count) + 0.5) * CELL_M for count in (case.columns, case.rows))
     east, north = parking_place(case)
@@ -158,7 +158,7 @@ def _percent(which: Bools) -> float:
 
 
 def _solve(task: Task[MapCase], _: Path) -> CaseResult:
-    """Simulate a case, merge it with every method, and judge the maps."""
+    """Simulate a case, merge by every method, judge."""
     case = task.variant
     scene, window = simulate(case, task.seed), CellWindow(0, 0, case.columns, case.rows)
     names = GRADE if case.judges_grade else RESISTANCE
@@ -171,7 +171,7 @@ def _solve(task: Task[MapCase], _: Path) -> CaseResult:
 
 
 def _timed(work: Callable[[], Output]) -> tuple[Output, float]:
-    """What the work returns, and its processor time [s]."""
+    """Result and CPU time [s]."""
     began_s = time.process_time()
     return work(), time.process_time() - began_s
 

@@ -1,6 +1,6 @@
-"""Methods that make one map of the samples of many machines: the map server's own, and what is usual elsewhere.
+"""Merge methods: the map server's own, and usual ones.
 
-The others assign a sample to the one cell that its stated position lies in, and know nothing of its covariance.
+The latter assign a sample to the cell of its stated position and ignore the covariance.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from mapserver.trust.auditor import Auditor
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.site.geometry import CellWindow
 
-Layers = dict[str, Floats]  # (rows, columns) by name, NaN where unknown
+Layers = dict[str, Floats]  # (rows, columns) by name, NaN unknown
 SERVER_LAYERS = ("resistance", "grade_east", "grade_north", "confidence")
-# What a layer is made of: a column, and its variance.
+# Source of a layer: column, variance.
 COLUMN = {
     "resistance": ("c_rr", "c_rr_var"),
     "grade_east": ("grade_e", "grade_var"),
     "grade_north": ("grade_n", "grade_var"),
 }
 GATE_SIGMA = 2.5  # of the Kalman filter
-# A rejected value adds so many of its own variances to its cell's, so that a change of the ground is accepted at last.
+# Variance added by an outlier, in units of its own, so that changes are accepted eventually.
 OUTLIER_VARIANCES = 10.0
 
 
 def soft_votes(deliveries: Sequence[Delivery], window: CellWindow) -> tuple[Layers, tuple[str, ...]]:
-    """The map server's map: its own trust, fold, change test and read, with the options that it has by default.
+    """The map server's default trust, fold, change test and read.
 
-    Returns its layers, and the machines that it excluded because they contradict all others.
+    Returns its layers, and machines excluded for contradicting all others.
     """
     bad = contradicting(deliveries)
     return folded([(d.machine, d.rows) for d in deliveries if d.machine not in bad], window), bad
 
 
 def folded(samples: Iterable[tuple[str, Table]], window: CellWindow, names: tuple[str, ...] = SERVER_LAYERS) -> Layers:
-    """What the map server makes of samples, machine by machine, all of which it trusts: its fold, change test, read."""
+    """The map server's layers of samples by machine, all trusted."""
     grid, config = Grid(CELL_M, FoldConfig()), ServerConfig()
     for machine, rows in samples:
         grid.fold(rows, machine)
@@ -52,7 +52,7 @@ def folded(samples: Iterable[tuple[str, Table]], window: CellWindow, names: tupl
 
 
 def contradicting(deliveries: Sequence[Delivery]) -> tuple[str, ...]:
-    """Machines that contradict all others, as the server's trust finds them at the end."""
+    """Machines that the server's trust finally excludes."""
     auditor = Auditor(CELL_M)
     for delivery in deliveries:
         auditor.add(delivery.machine, delivery.rows)
@@ -64,7 +64,7 @@ def contradicting(deliveries: Sequence[Delivery]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Hits:
-    """Values that fell into cells, oldest first: cell, value and variance (n,). cells: how many there are."""
+    """Values by cell, oldest first: cell, value, variance (n,). cells: total."""
 
     cell: Ints
     value: Floats
@@ -72,25 +72,25 @@ class Hits:
     cells: int
 
 
-Method = Callable[[Hits], Floats]  # value of each cell (cells,), NaN where there is none
+Method = Callable[[Hits], Floats]  # value per cell (cells,), NaN without
 
 
 def last_write(hits: Hits) -> Floats:
-    """The newest value of each cell, as in the paper."""
+    """Newest value per cell, as in the paper."""
     out: Floats = np.full(hits.cells, np.nan)
-    out[hits.cell] = hits.value  # where a cell is named twice, numpy keeps the last
+    out[hits.cell] = hits.value  # numpy keeps the last of repeated indices
     return out
 
 
 def mean(hits: Hits) -> Floats:
-    """Mean of all values of each cell."""
+    """Mean per cell."""
     count = np.bincount(hits.cell, minlength=hits.cells)
     total = np.bincount(hits.cell, hits.value, hits.cells)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def median(hits: Hits) -> Floats:
-    """Median of all values of each cell."""
+    """Median per cell."""
     value = hits.value[np.lexsort((hits.value, hits.cell))]
     count = np.bincount(hits.cell, minlength=hits.cells)
     first = np.cumsum(count) - count
@@ -102,16 +102,16 @@ def median(hits: Hits) -> Floats:
 
 
 def kalman(hits: Hits) -> Floats:
-    """A Kalman filter of one state per cell with a gate, as elevation mapping has it (Fankhauser et al. 2014).
+    """A gated one-state Kalman filter per cell, as in elevation mapping (Fankhauser et al. 2014).
 
-    A value beyond GATE_SIGMA is rejected, and makes the cell less sure instead. The k-th values of all cells are
-    filtered at once.
+    Values beyond GATE_SIGMA are rejected and raise the cell's variance. The k-th values of all cells are filtered at
+    once.
     """
     x: Floats = np.full(hits.cells, np.nan)
     P = np.zeros(hits.cells)
     for turn in _turns(hits.cell):
         cell, z, R = hits.cell[turn], hits.value[turn], hits.variance[turn]
-        if np.isnan(x[cell[0]]):  # the first turn, and only it, meets cells that are empty
+        if np.isnan(x[cell[0]]):  # only the first turn meets empty cells
             x[cell], P[cell] = z, R
             continue
         innovation = z - x[cell]
@@ -123,7 +123,7 @@ def kalman(hits: Hits) -> Floats:
 
 
 def _turns(cell: Ints) -> list[Ints]:
-    """Indices of the first values of all cells, of the second ones, and so on."""
+    """Indices of all cells' first values, second values, and so on."""
     order = np.argsort(cell, kind="stable")
     count = np.bincount(cell)
     rank = np.empty(len(cell), np.int64)
@@ -136,13 +136,13 @@ METHODS: dict[str, Method] = {"last_write": last_write, "mean": mean, "median": 
 
 
 def in_order(tables: Iterable[Table]) -> Table:
-    """All samples of some tables, oldest first."""
+    """Samples of several tables, oldest first."""
     rows = np.concatenate(list(tables))
     return rows[np.argsort(rows["stamp_ns"], kind="stable")]
 
 
 def hits_of(rows: Table, layer: str, window: CellWindow) -> Hits:
-    """What a layer's column puts into the cells of a window, row by row from the south."""
+    """A layer's values in a window's cells, row by row from the south."""
     value, variance = COLUMN[layer]
     column = np.floor(rows["x_m"] / CELL_M).astype(np.int64) - window.column
     row = np.floor(rows["y_m"] / CELL_M).astype(np.int64) - window.row
@@ -153,6 +153,6 @@ def hits_of(rows: Table, layer: str, window: CellWindow) -> Hits:
 
 
 def merge_hard(method: Method, rows: Table, names: Sequence[str], window: CellWindow) -> Layers:
-    """Layers (rows, columns) that a method makes of samples that lie oldest first."""
+    """Layers (rows, columns) of a method from samples, oldest first."""
     shape = (window.rows, window.columns)
     return {name: method(hits_of(rows, name, window)).reshape(shape) for name in names}

@@ -1,6 +1,6 @@
-"""The samples that the machines of a case send, with the truth: simulated straight away, without a localisation.
+"""Samples of a case's machines with truth, simulated without localisation.
 
-Position errors last (Gauss-Markov), as those of GPS do: on white ones every merge looks wonderful.
+Position errors are Gauss-Markov, like those of GPS; with white errors every merge looks good.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ STEP_M = SPEED_MPS * PERIOD_NS * 1e-9
 LANE_M = 1.0
 ERROR_TIME_S = 30.0  # correlation time of position errors
 C_RR_STD = 0.002
-# Of a gradient by attitude, along and across: white, and a bias of a machine's own that turns with it (0.1 degrees).
+# Gradient errors along and across: white, and a per-machine bias in machine axes (0.1 degrees).
 GRADE_STD, GRADE_BIAS_STD = 0.004, 0.0017
-START_NS = 1_772_433_000_000_000_000  # 2026-03-02 06:30 UTC; a work day begins up to ten minutes later
+START_NS = 1_772_433_000_000_000_000  # 2026-03-02 06:30 UTC; days start up to ten minutes later
 START_WITHIN_NS = 600_000_000_000
 BATCH_ROWS = 100
-LATENCY_NS = 150_000_000  # from the last sample of a batch to its receipt
+LATENCY_NS = 150_000_000  # from a batch's last sample to receipt
 BUCKET_NS = round(FoldConfig().bucket_s * 1e9)
 
 
 class Delivery(NamedTuple):
-    """A batch as the server gets it. rows: SAMPLE_DTYPE, in the order of their stamps."""
+    """A batch as received. rows: SAMPLE_DTYPE, by stamp."""
 
     machine: str
     rows: Table
@@ -42,7 +42,7 @@ class Delivery(NamedTuple):
 
 @dataclass(frozen=True)
 class Sweep:
-    """True track of a machine, one entry per sample: place [m], heading [rad], and number of the pass from 0."""
+    """True track of a machine per sample: place [m], heading [rad], pass number from 0."""
 
     x_m: Floats
     y_m: Floats
@@ -52,10 +52,10 @@ class Sweep:
 
 @dataclass(frozen=True)
 class MapScene:
-    """A simulated case: what machines sent, and what was true.
+    """A simulated case: sent samples, and truth.
 
-    deliveries: of all machines, as they arrived. site: the true ground; `c_rr_later` is how it was left.
-    repaved_ns: when, None where it was not. driven: cells (rows, columns) that a machine truly passed.
+    deliveries: of all machines, in order of arrival. site: true ground; `c_rr_later`: final. repaved_ns: None: never.
+    driven: truly passed cells (rows, columns).
     """
 
     deliveries: tuple[Delivery, ...]
@@ -65,12 +65,12 @@ class MapScene:
 
     @property
     def samples(self) -> int:
-        """How many."""
+        """Number of samples."""
         return sum(len(delivery.rows) for delivery in self.deliveries)
 
 
 def simulate(case: MapCase, seed: int) -> MapScene:
-    """All that the machines of a case send; the same seed gives the same bytes."""
+    """All samples of a case; reproducible to the byte."""
     site = build_site(case)
     draw, *draws = np.random.default_rng(seed).spawn(1 + len(case.machines))
     start_ns = START_NS + int(draw.integers(START_WITHIN_NS))
@@ -93,7 +93,7 @@ def simulate(case: MapCase, seed: int) -> MapScene:
 
 
 def sweep_lanes(case: MapCase, machine: CaseMachine, draw: np.random.Generator) -> Sweep:
-    """All passes of a machine, one after the other; turns between lanes lie outside of the site and are not sampled."""
+    """All passes of a machine; turns between lanes are off the site and not sampled."""
     passes = [_pass(case, machine.first + i, float(draw.uniform(0, LANE_M))) for i in range(machine.passes)]
     number = np.repeat(np.arange(len(passes)), [len(x) for x, _, _ in passes])
     x, y, heading = (np.concatenate(parts) for parts in zip(*passes, strict=True))
@@ -101,7 +101,7 @@ def sweep_lanes(case: MapCase, machine: CaseMachine, draw: np.random.Generator) 
 
 
 def _sweeps(case: MapCase, draws: list[np.random.Generator]) -> list[Sweep]:
-    """Sweeps of all machines; those that are parked stand until the last of the others is done."""
+    """Sweeps of all machines; parked ones stand until the longest ends."""
     sweeps = [None if m.parked else sweep_lanes(case, m, rng) for m, rng in zip(case.machines, draws, strict=True)]
     longest = max(len(sweep.x_m) for sweep in sweeps if sweep)
     x_m, y_m = (np.full(longest, place_m) for place_m in parking_place(case))
@@ -110,7 +110,7 @@ def _sweeps(case: MapCase, draws: list[np.random.Generator]) -> list[Sweep]:
 
 
 def _pass(case: MapCase, number: int, offset_m: float) -> tuple[Floats, Floats, Floats]:
-    """East, north [m] and heading [rad] of one pass: lane after lane, there and back."""
+    """East, north [m], heading [rad] of one pass: lanes there and back."""
     across = number % 2 == 1
     length, width = (case.rows, case.columns) if across else (case.columns, case.rows)
     along = np.arange(STEP_M / 2, length * CELL_M, STEP_M)
@@ -125,7 +125,7 @@ def _pass(case: MapCase, number: int, offset_m: float) -> tuple[Floats, Floats, 
 
 
 def passed(sweep: Sweep, site: Site) -> Bools:
-    """Cells (rows, columns) that a sweep passes: a step is shorter than a cell, so its two ends say it all."""
+    """Passed cells (rows, columns); steps are shorter than cells, so both ends suffice."""
     cells = np.zeros(site.c_rr.shape, np.bool_)
     for end_m in (-STEP_M / 2, STEP_M / 2):
         x_m, y_m = sweep.x_m + end_m * np.cos(sweep.heading_rad), sweep.y_m + end_m * np.sin(sweep.heading_rad)
@@ -134,14 +134,14 @@ def passed(sweep: Sweep, site: Site) -> Bools:
 
 
 def cell_of(x_m: Floats, y_m: Floats, site: Site) -> tuple[Ints, Ints]:
-    """Row and column of places; beyond the site, those of the nearest cell."""
+    """Row and column of places, clipped to the site."""
     rows, columns = site.c_rr.shape
     row, column = (np.floor(v / CELL_M).astype(np.int64) for v in (y_m, x_m))
     return np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
 
 
 def _repaved_ns(site: Site, sweep: Sweep, stamp_ns: Ints, draw: np.random.Generator) -> int:
-    """An instant while the machine drives in the zone, well inside a time bucket."""
+    """An instant with the machine in the zone, well inside a time bucket."""
     there = site.repaved[cell_of(sweep.x_m, sweep.y_m, site)] & (sweep.number == PASSES_BEFORE - 1)
     about_ns = int(stamp_ns[there][int(draw.uniform(0.1, 0.9) * there.sum())])
     return about_ns // BUCKET_NS * BUCKET_NS + int(draw.uniform(0.2, 0.8) * BUCKET_NS)
@@ -153,7 +153,7 @@ def _repaved_ns(site: Site, sweep: Sweep, stamp_ns: Ints, draw: np.random.Genera
 def sense(
     machine: CaseMachine, sweep: Sweep, stamp_ns: Ints, site: Site, repaved_ns: int | None, draw: np.random.Generator
 ) -> Table:
-    """The samples of a machine along its sweep."""
+    """Samples of a machine along its sweep."""
     n = len(stamp_ns)
     at = cell_of(sweep.x_m, sweep.y_m, site)
     later = np.zeros(n, np.bool_) if repaved_ns is None else stamp_ns >= repaved_ns
@@ -173,7 +173,7 @@ def sense(
 
 
 def gauss_markov(n: int, std: float, draw: np.random.Generator) -> Floats:
-    """Errors (n,) one period apart, stationary: b+ = exp(-dt/tau) b + std sqrt(1 - exp(-2 dt/tau)) w."""
+    """Stationary errors (n,), one per period: b+ = exp(-dt/tau) b + std sqrt(1 - exp(-2 dt/tau)) w."""
     kept = np.exp(-PERIOD_NS * 1e-9 / ERROR_TIME_S)
     noise = draw.normal(0.0, std * np.sqrt(1 - kept**2), n)
     noise[:1] = draw.normal(0.0, std)
@@ -181,14 +181,14 @@ def gauss_markov(n: int, std: float, draw: np.random.Generator) -> Floats:
 
 
 def batches(machine: str, rows: Table) -> Iterator[Delivery]:
-    """Cut the samples of a machine into what it sends at a time."""
+    """Split a machine's samples into batches."""
     for first in range(0, len(rows), BATCH_ROWS):
         batch = rows[first : first + BATCH_ROWS]
         yield Delivery(machine, batch, int(batch["stamp_ns"][-1]) + LATENCY_NS)
 
 
 def _gradient_error(heading_rad: Floats, draw: np.random.Generator) -> Floats:
-    """Errors east and north (n, 2) of a gradient that is measured along and across."""
+    """Errors east and north (n, 2) of gradients measured along and across."""
     n = len(heading_rad)
     along, across = draw.normal(0.0, GRADE_STD, (2, n)) + draw.normal(0.0, GRADE_BIAS_STD, (2, 1))
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)

@@ -1,7 +1,7 @@
-"""Whether a map can be believed where it says how sure it is: of classes, and of standard deviations.
+"""Whether stated uncertainty is right: of classes, and of standard deviations.
 
-A forecast says of a cell which class it has, and how likely that is. The server's is its leading class with
-`confidence`; the others are made of the same samples, each in the one cell of its stated place.
+A forecast states a cell's class and its probability. The server's: leading class with `confidence`; others use the same
+samples, each in its stated cell.
 """
 
 from __future__ import annotations
@@ -18,35 +18,35 @@ from protocol.arrays import AnyArray, Bools, Floats, Ints
 from protocol.site.ground_classes import BOUNDARIES, UNKNOWN, resistance_class
 from sitegrid.proof.figures import Row, rounded
 
-BINS = 10  # of confidence, equally wide
-CLIP = 0.001  # nobody is surer than that: the logarithmic score of a certain error would be infinite
+BINS = 10  # equal bins of confidence
+CLIP = 0.001  # bound of confidence: the log score of a certain error is infinite
 SIGMAS_95 = 1.96
 DIGITS = 4
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Of cells, in an array of any shape: class, UNKNOWN where there is none, and how likely it is, 0 to 1."""
+    """Per cell, any shape: class, or UNKNOWN, and probability."""
 
     kind: Ints
     confidence: Floats
 
     def judged(self, true: Ints, where: Bools) -> Believed:
-        """Its known cells among some of them, against true classes."""
+        """Known cells among `where`, against true classes."""
         known: Bools = where & (self.kind != UNKNOWN)
         return Believed(self.confidence[known], (self.kind == true)[known])
 
 
 @dataclass(frozen=True)
 class Believed:
-    """Of n cells: how likely their class was said to be, and whether it was right."""
+    """Of n cells: stated probability of their class, and whether it was right."""
 
     confidence: Floats
     right: Bools
 
     @property
     def reliability(self) -> list[Row]:
-        """Cells by confidence, in bins: how many, mean confidence, and share that is right."""
+        """Cells by bins of confidence: number, mean confidence, share right."""
         which = np.minimum((self.confidence * BINS).astype(np.int64), BINS - 1)
         rows = []
         for i in range(BINS):
@@ -58,19 +58,19 @@ class Believed:
 
     @property
     def calibration_error(self) -> float:
-        """Expected calibration error: mean distance between what was said and what was right, over cells."""
+        """Expected calibration error: mean distance of confidence from share right."""
         bins = [row for row in self.reliability if row["cells"]]
         off = [row["cells"] * abs(row["said"] - row["right"]) for row in bins]
         return float(sum(off)) / max(1, len(self.right))
 
     @property
     def brier(self) -> float:
-        """Mean square of confidence minus 1 where the class is right, minus 0 where not; the less the better."""
+        """Brier score: mean squared error of confidence; lower is better."""
         return float(((self.confidence - self.right) ** 2).mean()) if len(self.right) else math.nan
 
     @property
     def log_score(self) -> float:
-        """Mean of minus the logarithm of the likelihood of what was so; the less the better."""
+        """Log score: mean negative log-likelihood of the outcome; lower is better."""
         said = np.clip(self.confidence, CLIP, 1 - CLIP)
         return float(-np.log(np.where(self.right, said, 1 - said)).mean()) if len(self.right) else math.nan
 
@@ -81,7 +81,7 @@ def pooled(parts: Sequence[Believed]) -> Believed:
 
 
 def by_frequency(hits: Hits) -> Forecast:
-    """The class of the newest value of each cell, as likely as its share of all values there."""
+    """Class of each cell's newest value, with its share of values as probability."""
     newest = resistance_class(last_write(hits))
     same = (resistance_class(hits.value) == newest[hits.cell]).astype(np.float64)
     count, alike = np.bincount(hits.cell, minlength=hits.cells), np.bincount(hits.cell, same, hits.cells)
@@ -89,7 +89,7 @@ def by_frequency(hits: Hits) -> Forecast:
 
 
 def by_mean(hits: Hits) -> Forecast:
-    """The class of the mean, as likely as a normal distribution has it that is as wide as values and their errors."""
+    """Class of the mean, with probability by a normal distribution of the scatter and stated errors."""
     parts = (hits.value, hits.value**2, hits.variance)
     middle, square, stated = (mean(replace(hits, value=part)) for part in parts)
     known = np.isfinite(middle)
@@ -103,7 +103,7 @@ def by_mean(hits: Hits) -> Forecast:
 
 
 def coverage_pct(error: AnyArray, std: AnyArray) -> float:
-    """Share of errors within the 95 % interval of a normal distribution of so much deviation [%]; NaN ones drop out."""
+    """Share [%] of errors in the 95 % interval of a normal distribution; NaN ignored."""
     known = np.isfinite(error) & np.isfinite(std)
     if not known.any():
         return math.nan
@@ -111,13 +111,13 @@ def coverage_pct(error: AnyArray, std: AnyArray) -> float:
 
 
 def forecast_row(named: Row, believed: Believed) -> Row:
-    """The figures of a forecast."""
+    """Figures of a forecast."""
     figures = {name: getattr(believed, name) for name in ("calibration_error", "brier", "log_score")}
     return rounded({**named, "cells": len(believed.right), **figures, "reliability": believed.reliability}, DIGITS)
 
 
 def layers_forecast(layers: Mapping[str, AnyArray]) -> Forecast:
-    """The server's: `resistance_class` and `confidence`."""
+    """The server's forecast: `resistance_class` and `confidence`."""
     kind = layers["resistance_class"]
     known = np.isfinite(kind)
     classes = np.where(known, kind, UNKNOWN).astype(np.int64)

@@ -1,1 +1,1 @@
-"""The paper repeated: its tables and maps, and what this project makes of the same drives."""
+"""The paper repeated: its tables and maps, and ours of the same drives."""

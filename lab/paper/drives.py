@@ -1,4 +1,4 @@
-"""What is driven for the paper's tables: one machine with each set of sensors, and fleets; in full, or quickly."""
+"""Drives for the paper's tables: one machine per set of sensors, and fleets; in full, or quickly."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from lab.paper.maps import Fleet
 from lab.positions.configurations import HEADLINE, PROFILES, Configuration, configurations
 from lab.positions.published import PLOTTING, POSITIONS
 
-FLEET_SHARE = 0.75  # of the length of other recordings: 900 s, as `eval fleet` has
+FLEET_SHARE = 0.75  # of other recordings' length: 900 s
 MACHINES = 4
-RECOMMENDED = Configuration("ukf", 2, 1, "default")  # the paper's choice of sensors, with this project's filter
+RECOMMENDED = Configuration("ukf", 2, 1, "default")  # the paper's choice of sensors with our filter
 
 
 @dataclass(frozen=True)
 class MapSource:
-    """Where the samples of some maps come from: a recording, and the configuration of its machines.
+    """Source of maps: a recording and its machines' configuration.
 
-    preset: of the sensors. machines: all of the recording.
+    preset: of sensors. machines: all of the recording.
     """
 
     scenario: str
@@ -31,24 +31,24 @@ class MapSource:
 
     @property
     def agents(self) -> tuple[Agent, ...]:
-        """The agents, as they are by default; a lone one with the sensors of its configuration."""
+        """Default agents; a lone one with the configured sensors."""
         if self.machines == 1:
             return (Agent(0, closed_tours=True, configuration=self.configuration),)
         return tuple(Agent(index, closed_tours=True) for index in range(self.machines))
 
     def drive(self, seed: int, plan: Plan) -> PlannedDrive:
-        """The recording of a seed."""
+        """Recording of a seed."""
         if self.machines == 1:
             return PlannedDrive(seed, plan.seconds, self.preset, plan.setup)
         count = self.machines if self.scenario == PAPER.scenario else 0
         return planned(self.scenario, seed, FLEET_SHARE * plan.seconds, count, self.preset, plan.setup.world)
 
     def runs(self, seed: int, plan: Plan) -> list[Task[Agent]]:
-        """What has to run before its maps are made."""
+        """Tasks before its maps."""
         return [replay_task(agent, self.drive(seed, plan)) for agent in self.agents]
 
     def maps(self, seed: int, plan: Plan) -> Task[Fleet]:
-        """The making of its maps."""
+        """Task of its maps."""
         return replay_task(Fleet(self.agents), self.drive(seed, plan))
 
 
@@ -65,7 +65,7 @@ FLEETS = tuple(
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run: seeds, seconds of each recording of one machine, rows of both tables, and who drives them."""
+    """Scope: seeds, seconds per recording of one machine, rows of both tables, setup."""
 
     seeds: Sequence[int]
     seconds: float
@@ -74,7 +74,7 @@ class Plan:
     setup: Setup = PAPER
 
 
-# A minute in the fast world: what it shows is that all of it works, and gives the same figures again.
+# Smoke test of a minute in the fast world, reproducible.
 QUICK = Plan(
     seeds=(0,),
     seconds=60.0,

@@ -1,6 +1,6 @@
-"""The paper's tables: positions by sensors, and maps with their wrong cells, beside what the paper reports.
+"""The paper's tables: positions by sensors, and wrong map cells, beside the published figures.
 
-Maps are kept, and compared with the truth anew.
+Maps are cached, their comparison is not.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from sitegrid.logs.replay import Score
 from sitegrid.proof.figures import Report, Row, half_width, rounded
 from sitegrid.proof.map_score import driven_cells, score, score_driven
 
-LEAST_S = 60.0  # of a recording: a heading is known after some seconds, calibration needs ground that is driven again
+LEAST_S = 60.0  # of a recording: heading needs seconds, calibration needs repeated ground
 PLACES = ("rmse_x_m", "rmse_y_m", "net_m")
-# Of truly driven cells, and of all that were plotted, as the paper counts them.
+# Of truly driven cells, and of all plotted ones, the paper's count.
 DRIVEN = ("wrong_resistance_pct", "wrong_grade_pct", "known_pct", "cells")
 PLOTTED = ("plotted_wrong_resistance_pct", "plotted_wrong_grade_pct", "plotted_cells")
 WITH_INTERVAL = ("net_m", *DRIVEN[:2], *PLOTTED[:2])
 DIGITS = 4
 
-DEVIATIONS = {"resistance_std": ("resistance",), "grade_std": ("grade_east", "grade_north")}  # of which layers
+DEVIATIONS = {"resistance_std": ("resistance",), "grade_std": ("grade_east", "grade_north")}  # their layers
 
 
 @dataclass(frozen=True)
 class MapOutcome:
-    """The maps of one source with one seed."""
+    """Maps of one source and seed."""
 
     source: MapSource
     drive: PlannedDrive
@@ -56,19 +56,19 @@ class MapOutcome:
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What pictures and files are made of."""
+    """Input of pictures and files."""
 
     plan: Plan
     positions: Scores
     maps: Sequence[MapOutcome]
 
     def all_of(self, source: MapSource) -> list[MapOutcome]:
-        """The maps of a source, seed by seed."""
+        """Maps of a source by seed."""
         return [each for each in self.maps if each.source == source]
 
 
 def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
-    """Record, replay, plot and judge; a row per configuration of either table. SitegridError where drives are short."""
+    """Record, replay, plot and judge; a row per configuration of either table. SitegridError for short drives."""
     if plan.seconds < LEAST_S:
         raise SitegridError(f"seconds: {plan.seconds:g} is too short; maps need drives of {LEAST_S:g} s or more")
     outcomes = Outcomes(plan, _positions(runner, plan), _maps(runner, plan))
@@ -94,21 +94,21 @@ def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
 
 
 def write_map(outcomes: Outcomes, runner: Runner, path: Path) -> None:
-    """Write the map that the paper plots, by its own method with the sensors that it recommends, of the first seed."""
+    """Write the paper's map by its own method with its recommended sensors, first seed."""
     theirs = replace(RECOMMENDED, profile="paper")
     outcome = next(each for each in outcomes.maps if each.source.machines == 1 and each.source.configuration == theirs)
     write_tensor(path, outcome.made.layers_of(PAPERS), scene(outcome.drive, runner.cache).truth)
 
 
 def _positions(runner: Runner, plan: Plan) -> Scores:
-    """Tables 1 and 2, by the replays of `lab positions`."""
+    """Tables 1 and 2, replayed as in `lab positions`."""
     planned = [PlannedDrive(seed, plan.seconds, PAPER.preset, plan.setup) for seed in plan.seeds]
     rows = [positions.as_recorded(row, planned[0]) for row in plan.positions]
     return positions.scored(runner, planned, rows)
 
 
 def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
-    """The maps of Table 3, and those of fleets."""
+    """Maps of Table 3 and of fleets."""
     pairs = [(source, seed) for seed in plan.seeds for source in plan.sources]
     runner.run(drives.EXPERIMENT, [task for source, seed in pairs for task in source.runs(seed, plan)])
     made = runner.run(maps.EXPERIMENT, [source.maps(seed, plan) for source, seed in pairs])
@@ -121,7 +121,7 @@ def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
 
 
 def position_row(plan: Plan, row: Configuration, runs: Sequence[Score]) -> Row:
-    """One row of Tables 1 and 2: means over the seeds."""
+    """Row of Tables 1 and 2: means over seeds."""
     figures = [{name: getattr(run, name) for name in (*PLACES, "us_per_second")} for run in runs]
     named = {"table": "positions", "scenario": plan.setup.scenario, "preset": PAPER.preset, **_sensors(row)}
     nothing = dict.fromkeys(("values", "calibration", "merge"))
@@ -129,7 +129,7 @@ def position_row(plan: Plan, row: Configuration, runs: Sequence[Score]) -> Row:
 
 
 def map_row(source: MapSource, kind: MapKind, figures: Sequence[Row], true_figures: Sequence[Row]) -> Row:
-    """One row of Table 3: means over the seeds. true_figures: of the same samples with true zeros and scales."""
+    """Row of Table 3: means over seeds. true_figures: the same samples with true bias and scale."""
     named = {"table": "maps", "scenario": source.scenario, "preset": source.preset, **_sensors(source.configuration)}
     published = PLOTTING.get(source.configuration.group) if source.machines == 1 else None
     row = _row({**named, **vars(kind), "machines": source.machines}, figures, published)
@@ -146,7 +146,7 @@ def _sensors(row: Configuration) -> Row:
 
 
 def _row(named: Row, figures: Sequence[Row], published: Published | None) -> Row:
-    """Means over the seeds, half-widths of their intervals, and what the paper reports; None where there is nothing."""
+    """Means over seeds, interval half-widths, published figures; None if missing."""
     by_seed: dict[str, Floats] = {
         name: np.array([each[name] for each in figures], float)
         for name in (*PLACES, *DRIVEN, *PLOTTED, "us_per_second")
@@ -168,7 +168,7 @@ def _row(named: Row, figures: Sequence[Row], published: Published | None) -> Row
 
 
 def _figures(outcome: MapOutcome, kind: MapKind, runner: Runner) -> Row:
-    """Figures of one map of one seed; its errors are of the places where samples were put."""
+    """Figures of one map and seed, with its samples' position errors."""
     true = scene(outcome.drive, runner.cache)
     region, truth = region_of(true.truth, outcome.made.layers_of(kind)), true_layers(true.truth)
     driven = score_driven(region, truth, [track.place_m for track in true.tracks.values()])
@@ -185,7 +185,7 @@ def _figures(outcome: MapOutcome, kind: MapKind, runner: Runner) -> Row:
 
 
 def forecast_rows(source: MapSource, outcomes: Outcomes, runner: Runner) -> list[Row]:
-    """How likely classes are said to be, by the server and by others of the same samples, over truly driven cells."""
+    """Class probabilities of the server and of others on the same samples, over truly driven cells."""
     believed: dict[str, list[Believed]] = {name: [] for name in (SERVED.merge, *FORECASTS)}
     for outcome in outcomes.all_of(source):
         true, made = _driven(outcome, runner), outcome.made
@@ -199,7 +199,7 @@ def forecast_rows(source: MapSource, outcomes: Outcomes, runner: Runner) -> list
 
 
 def coverage_rows(source: MapSource, outcomes: Outcomes, runner: Runner) -> list[Row]:
-    """How often errors lie within the 95 % interval of the deviations that the server states, over driven cells."""
+    """Share of errors in the 95 % interval stated by the server, over driven cells."""
     errors: dict[str, list[AnyArray]] = {name: [] for name in DEVIATIONS}
     stated: dict[str, list[AnyArray]] = {name: [] for name in DEVIATIONS}
     for outcome in outcomes.all_of(source):
@@ -216,7 +216,7 @@ def coverage_rows(source: MapSource, outcomes: Outcomes, runner: Runner) -> list
 
 @dataclass(frozen=True)
 class TrueCells:
-    """Truth of the cells (rows, columns) of a recording: layers, class, and whether a load centre passed."""
+    """Truth by cell (rows, columns): layers, class, whether a load centre passed."""
 
     layers: Mapping[str, Floats32]
     kind: Ints
@@ -238,7 +238,7 @@ def _of(source: MapSource) -> Row:
 
 
 def contradictions() -> list[Row]:
-    """Rows of the paper whose net error is not that of their x and y."""
+    """Rows of the paper whose net error contradicts x and y."""
     tables = (("Tables 1 and 2", POSITIONS), ("Table 3", PLOTTING))
     return [
         {

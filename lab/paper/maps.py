@@ -1,7 +1,7 @@
-"""The maps of one recording: the paper's plotter and this project's merge, with true values and with estimated ones.
+"""Maps of one recording: the paper's plotter and our merge, with true and estimated values.
 
-Every map is made of the samples that whole pipelines make. A plotter draws at once, so `last_write` has the places that
-were known at once; a map server gets samples at their smoothed places.
+Samples come from whole pipelines. A plotter draws at once, so `last_write` uses real-time positions; a map server uses
+smoothed ones.
 """
 
 from __future__ import annotations
@@ -26,19 +26,18 @@ from protocol.arrays import Bools, Floats, Floats32, Table
 from sim.truth import TruthMap
 from sitegrid.proof.figures import root_mean_square
 
-PLOTTED = ("resistance", "grade_east", "grade_north")  # all that `last_write` has
+PLOTTED = ("resistance", "grade_east", "grade_north")  # layers of `last_write`
 LAYERS = (*SERVER_LAYERS, "resistance_class", "resistance_std", "grade_std")
-TRUE_STD = 1e-4  # stated of true values
-FORECASTS = {"last_write": by_frequency, "mean": by_mean}  # beside the server's
+TRUE_STD = 1e-4  # stated for true values
+FORECASTS = {"last_write": by_frequency, "mean": by_mean}  # besides the server's
 
 
 @dataclass(frozen=True)
 class MapKind:
     """How a map is made of samples.
 
-    values: "oracle", looked up at the true place, or "estimated". calibration: of estimated values, "none" as agents
-    send them, "server" as the map server corrects them, "truth" by what they are truly off. merge: "last_write" or
-    "soft_votes".
+    values: "oracle": true ones at the true place, or "estimated". calibration: of estimated values, "none": as sent,
+    "server": as corrected by the map server, "truth": true errors removed. merge: "last_write" or "soft_votes".
     """
 
     values: str
@@ -47,36 +46,36 @@ class MapKind:
 
     @property
     def is_live(self) -> bool:
-        """Whether samples lie where machines believed to be at once, not where they were smoothed to."""
+        """Whether real-time positions are used instead of smoothed ones."""
         return self.merge == "last_write"
 
 
 PAPERS = MapKind("oracle", None, "last_write")  # the paper's plotter
 PLOTTED_ESTIMATES = MapKind("estimated", "none", "last_write")
 OURS = MapKind("oracle", None, "soft_votes")
-SERVED = MapKind("estimated", "server", "soft_votes")  # what the map server shows
+SERVED = MapKind("estimated", "server", "soft_votes")  # the map server's
 AS_SENT, AS_TRUE = (MapKind("estimated", calibration, "soft_votes") for calibration in ("none", "truth"))
 KINDS = (PAPERS, PLOTTED_ESTIMATES, OURS, AS_SENT, SERVED, AS_TRUE)
 
 
 @dataclass(frozen=True)
 class Fleet:
-    """Whose samples make a map: agents of one recording."""
+    """Agents of one recording whose samples make a map."""
 
     agents: tuple[Agent, ...]
 
     @property
     def name(self) -> str:
-        """Short and unique."""
+        """Short unique name."""
         return "+".join(agent.name for agent in self.agents)
 
 
 @dataclass(frozen=True)
 class MadeMaps:
-    """The maps of one recording. layers: (KINDS, LAYERS, rows, columns), NaN where unknown.
+    """Maps of one recording. layers: (KINDS, LAYERS, rows, columns), NaN unknown.
 
-    forecasts: (FORECASTS, 2, rows, columns), class and confidence of others by the samples that the server folds.
-    rmse_m: (2, 2), east and north, of the places of the samples, as known at once and smoothed. samples: how many.
+    forecasts: (FORECASTS, 2, rows, columns), class and confidence of others on the server's samples. rmse_m: (2, 2),
+    position RMSE east and north, real-time and smoothed. samples: number.
     """
 
     layers: Floats32
@@ -85,22 +84,22 @@ class MadeMaps:
     samples: int
 
     def layers_of(self, kind: MapKind) -> dict[str, Floats32]:
-        """The layers of one map."""
+        """Layers of one map."""
         return dict(zip(LAYERS, self.layers[KINDS.index(kind)], strict=True))
 
     def forecast(self, method: str) -> Forecast:
-        """What a method says of each cell."""
+        """A method's class and confidence by cell."""
         kind, confidence = self.forecasts[list(FORECASTS).index(method)].astype(np.float64)
         return Forecast(kind.astype(np.int64), confidence)
 
     def errors_m(self, kind: MapKind) -> tuple[float, float]:
-        """Root mean square errors east and north of the places of its samples."""
+        """Position RMSE of its samples, east and north."""
         east, north = self.rmse_m[0 if kind.is_live else 1].tolist()
         return east, north
 
 
 def with_true_values(rows: Table, true: Scene, name: str) -> Table:
-    """Samples with what the true map has in the cell where the machine truly was; those of no known place drop out."""
+    """Samples with the true map's values at the true place; unplaced ones are dropped."""
     known: Bools = np.isfinite(true.tracks[name].at(rows["stamp_ns"]).place_m[:, 0])
     rows = rows[known].copy()
     at, truth = cells(truth_places(rows, true, name), true), true.truth
@@ -110,12 +109,12 @@ def with_true_values(rows: Table, true: Scene, name: str) -> Table:
 
 
 def plotted(rows: Mapping[str, Table], truth: TruthMap) -> Layers:
-    """The paper's plotter: a cell has the value that was written last."""
+    """The paper's plotter: the last value per cell."""
     return merge_hard(last_write, in_order(rows.values()), PLOTTED, window_of(truth))
 
 
 def make_maps(live: Rows, final: Rows, true: Scene) -> MadeMaps:
-    """All maps of the samples of some machines. live, final: the same ones as known at once, and smoothed."""
+    """All maps of some machines' samples, real-time and final."""
     truth, corrected_by_server = true.truth, served(final)
     data = Tampered(final, truth.c_rr)
     samples: dict[MapKind, Rows] = {
@@ -139,19 +138,19 @@ def make_maps(live: Rows, final: Rows, true: Scene) -> MadeMaps:
 
 
 def _by_truth(rows: Table, name: str, data: Tampered, true: Scene) -> Table:
-    """A machine's samples without what the truth shows that they are off by."""
+    """Samples with the true errors removed."""
     return corrected(rows, [as_correction(name, error) for error in true_errors(data, name, true, 1)])
 
 
 def rmse_m(rows: Rows, true: Scene) -> tuple[float, float]:
-    """Root mean square errors of places, east and north, where the truth is known."""
+    """Position RMSE, east and north, where the truth is known."""
     off_m = np.concatenate([_off_m(table, true, name) for name, table in rows.items()])
     known = off_m[np.isfinite(off_m).all(axis=1)]
     return root_mean_square(known[:, 0]), root_mean_square(known[:, 1])
 
 
 def _off_m(rows: Table, true: Scene, name: str) -> Floats:
-    """How far samples are from where the load centre was (n, 2), east and north."""
+    """Position errors (n, 2), east and north."""
     return np.asarray(np.stack([rows["x_m"], rows["y_m"]], axis=1) - true.tracks[name].at(rows["stamp_ns"]).place_m)
 
 
@@ -159,7 +158,7 @@ def _off_m(rows: Table, true: Scene, name: str) -> Floats:
 
 
 def _solve(task: Task[Fleet], cache: Path) -> MadeMaps:
-    """Make the maps of one recording, whose agents have run before."""
+    """Maps of one recording whose agents have run."""
     assert task.drive
     true = scene(task.drive, cache)
     names = sorted(true.tracks)
@@ -170,7 +169,7 @@ def _solve(task: Task[Fleet], cache: Path) -> MadeMaps:
 
 
 def samples_of(agent: Agent, drive: PlannedDrive, cache: Path) -> AgentSamples:
-    """What an agent that has run made of a recording."""
+    """Cached samples of an agent."""
     return read_result(AgentSamples, drives.EXPERIMENT.file(replay_task(agent, drive), cache))
 
 

@@ -1,4 +1,4 @@
-"""Pictures like the paper's, of the first seed: true maps, plotted maps, and wrong cells in white."""
+"""Pictures like the paper's, first seed: true maps, plotted maps, wrong cells in white."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import matplotlib as mpl
 
-mpl.use("Agg")  # no screen is needed
+mpl.use("Agg")  # no display
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -29,16 +29,16 @@ from protocol.site.ground_classes import SLOPE, UNKNOWN, ZONES, resistance_class
 
 DPI, PANEL_IN = 110, 3.1
 STYLE: Any = {"figure.constrained_layout.use": True, "font.size": 9, "legend.frameon": False, "savefig.bbox": "tight"}
-ZONE_RGB: Floats = np.array([zone.bgr[::-1] for zone in ZONES]) / 255  # as in the server's pictures
+ZONE_RGB: Floats = np.array([zone.bgr[::-1] for zone in ZONES]) / 255  # the server's colours
 GRADE_RGB = ZONE_RGB[:2]  # flat and slope, as in the paper
 UNKNOWN_RGB = (0.88, 0.88, 0.88)
-BEHIND_RGB, WRONG_RGB = (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)  # of difference maps: what was not plotted, what is wrong
+BEHIND_RGB, WRONG_RGB = (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)  # of difference maps: not plotted, wrong
 DARKNESS = 0.5  # of right cells there
 Titled = tuple[str, MapOutcome, MapKind]
 
 
 def draw(outcomes: Outcomes, runner: Runner, folder: Path) -> list[Path]:
-    """Draw all pictures into a folder, each as NAME.png; returns their paths."""
+    """Draw all pictures as NAME.png into a folder; returns their paths."""
     maps, fleets = (_shown(outcomes, several=several) for several in (False, True))
     drawn: dict[str, Callable[[], Figure]] = {
         "truth": partial(draw_truth, maps[0][1], runner),
@@ -57,7 +57,7 @@ def draw(outcomes: Outcomes, runner: Runner, folder: Path) -> list[Path]:
 
 
 def _shown(outcomes: Outcomes, *, several: bool) -> list[Titled]:
-    """The maps that are shown: of one machine the paper's of each configuration, then this project's; or of fleets."""
+    """Maps to show: per configuration of one machine the paper's, then ours; or fleets."""
     out: list[Titled] = []
     for source in outcomes.plan.sources:
         if several != (source.machines > 1):
@@ -80,7 +80,6 @@ def _shown(outcomes: Outcomes, *, several: bool) -> list[Titled]:
 
 
 def _classes(layers: NamedLayers) -> tuple[Ints, Ints]:
-    """Classes of resistance and of grade."""
     return resistance_class(layers["resistance"]), slope_class(layers["grade_east"], layers["grade_north"])
 
 
@@ -96,7 +95,7 @@ def _image(axes: Axes, rgb: Floats) -> None:
 
 
 def _grid(count: int, rows: int) -> tuple[Figure, Any]:
-    """A figure of so many columns of maps."""
+    """A figure with `count` columns of maps."""
     size = (PANEL_IN * count, 2.6 * rows + 0.8)
     return plt.subplots(rows, count, figsize=size, squeeze=False, sharex=True, sharey=True)
 
@@ -122,7 +121,7 @@ def _key(*more: Patch) -> list[Patch]:
 
 
 def draw_truth(outcome: MapOutcome, runner: Runner) -> Figure:
-    """The true maps of resistance and of grade."""
+    """True maps of resistance and grade."""
     figure, panels = _grid(2, 1)
     classes = _classes(true_layers(scene(outcome.drive, runner.cache).truth))
     parts = zip(panels[0], classes, (ZONE_RGB, GRADE_RGB), ("rolling resistance", "grade"), strict=True)
@@ -134,7 +133,7 @@ def draw_truth(outcome: MapOutcome, runner: Runner) -> Figure:
 
 
 def draw_maps(maps: Sequence[Titled]) -> Figure:
-    """The maps as they were plotted: resistance above, grade below."""
+    """Plotted maps: resistance above, grade below."""
     figure, panels = _grid(len(maps), 2)
     for column, (title, outcome, kind) in zip(panels.T, maps, strict=True):
         for axes, classes, palette in zip(
@@ -146,7 +145,7 @@ def draw_maps(maps: Sequence[Titled]) -> Figure:
 
 
 def draw_differences(maps: Sequence[Titled], runner: Runner) -> Figure:
-    """Wrong cells in white, on what was plotted; J is that of all plotted cells, as in the paper."""
+    """Wrong cells in white; J over all plotted cells, as in the paper."""
     figure, panels = _grid(len(maps), 2)
     for column, (title, outcome, kind) in zip(panels.T, maps, strict=True):
         true = _classes(true_layers(scene(outcome.drive, runner.cache).truth))

@@ -1,4 +1,4 @@
-"""The tables of the paper's report for people: each figure with its interval, and the paper's in brackets."""
+"""Tables of the paper's report for people: figures with intervals, the paper's in brackets."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ MAPS = (
     ("J_r plotted [%]", PLOTTED[0]),
     ("J_s plotted [%]", PLOTTED[1]),
 )
-PAPERS = {PLOTTED[0]: DRIVEN[0], PLOTTED[1]: DRIVEN[1]}  # whose J is of all cells that were plotted
+PAPERS = {PLOTTED[0]: DRIVEN[0], PLOTTED[1]: DRIVEN[1]}  # J over all plotted cells
 
 
 def readable(report: Report) -> Report:
-    """The report with a table per kind of row, in place of rows that have the columns of all."""
+    """The report with one table per kind of row."""
     positions, maps = ([row for row in report["rows"] if row["table"] == table] for table in ("positions", "maps"))
     tables = {
         "positions": [
@@ -46,7 +46,7 @@ def _cells(row: Row, columns: tuple[tuple[str, str], ...]) -> Row:
 
 
 def _cell(row: Row, name: str) -> str:
-    """A mean, the half-width of its interval, and the paper's figure where it has one that counts alike."""
+    """Mean, interval half-width, and the paper's comparable figure."""
     if row[name] is None or row[name] != row[name]:
         return "-"
     half = row["ci95"].get(name)

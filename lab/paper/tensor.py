@@ -1,4 +1,4 @@
-"""The paper's map as one array: two layers of m x n cells, each of them east, north and value."""
+"""The paper's map as one array: two layers of m x n cells with east, north, value."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from sim.truth import TruthMap
 
 
 def tensor(layers: NamedLayers, truth: TruthMap) -> Floats:
-    """A map (2, m, n, 3) over m cells to the east and n to the north: x, y of their centres [m], value.
+    """A map (2, m, n, 3) over m cells east and n cells north: centre x, y [m], value.
 
-    Layer 0 is resistance [-], layer 1 steepness [m/m], as the paper does not tell uphill from downhill. The value of a
-    cell that was never passed is NaN; its place is known.
+    Layer 0: resistance [-]; layer 1: steepness [m/m], as the paper ignores direction. Cells never passed have value
+    NaN.
     """
     region = region_of(truth, {})
     x_m, y_m = np.meshgrid(region.x_m, region.y_m, indexing="ij")

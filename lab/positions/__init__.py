@@ -1,1 +1,1 @@
-"""How right positions are: the paper's table."""
+"""Position accuracy: the paper's table."""

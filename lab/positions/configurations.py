@@ -1,4 +1,4 @@
-"""The configurations of the paper's table: filter, sensors, profile, and how each becomes options of the pipeline."""
+"""Configurations of the paper's table as pipeline options: filter, sensors, profile."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ HEADLINE = ((1, 1), (2, 1), (3, 1))
 
 @dataclass(frozen=True)
 class Configuration:
-    """One row of the table: filter, number of GPS receivers and IMUs, profile.
+    """A row: filter, numbers of GPS receivers and IMUs, profile.
 
-    machine_share: share of the slow GPS errors' variance that the receivers have in common; None: as it was recorded.
+    machine_share: common share of slow GPS error variance; None: as recorded.
     """
 
     filter: str
@@ -31,33 +31,33 @@ class Configuration:
 
     @property
     def name(self) -> str:
-        """A name for files."""
+        """Name for files."""
         share = "" if self.machine_share is None else f"-{self.machine_share:g}shared"
         return f"{self.filter}-{self.profile}-{self.gps}gps-{self.imu}imu{share}"
 
     @property
     def group(self) -> Group:
-        """As the paper groups them."""
+        """The paper's group."""
         return self.filter, self.gps, self.imu
 
     @property
     def sensors(self) -> tuple[int, int, float | None]:
-        """Number of GPS receivers and of IMUs, and what the receivers share."""
+        """GPS receivers, IMUs, machine_share."""
         return self.gps, self.imu, self.machine_share
 
     @property
     def options(self) -> PipelineConfig:
-        """The pipeline's."""
+        """Pipeline options."""
         return PipelineConfig(localisation=LocalisationConfig(filter=self.filter, profile=self.profile))
 
     @property
     def tuning(self) -> LocalisationTuning:
-        """Of localisation."""
+        """Tuning of localisation."""
         return TUNING
 
     @property
     def published_net_m(self) -> float | None:
-        """Net RMSE [m] that the paper reports, with either profile; None where it has no such row."""
+        """Published net RMSE [m] for either profile; None without such a row."""
         published = POSITIONS.get(self.group)
         return published.net_m if published else None
 
@@ -65,12 +65,12 @@ class Configuration:
 def configurations(
     sensors: Sequence[tuple[int, int]] = SENSORS, shares: Sequence[float | None] = (None,)
 ) -> list[Configuration]:
-    """All rows of the table: both filters and both profiles with each set of sensors, share by share."""
+    """All rows: both filters and profiles per set of sensors, share by share."""
     return [
         Configuration(f, gps, imu, p, share)
         for share in shares
         for gps, imu in sensors
-        if gps or share == shares[0]  # without a receiver there is nothing to share
+        if gps or share == shares[0]  # without receivers nothing is shared
         for p in PROFILES
         for f in FILTERS
     ]

@@ -1,9 +1,8 @@
-"""The paper's table: every configuration on the same recordings of the paper's site, against the truth.
+"""The paper's table: all configurations on the same recordings, against the truth.
 
-Poses are all it compares, so only the localising half of the pipeline runs, without ground estimation and sampling;
-`us_per_second` is what localisation costs, which is the paper's argument for cheap sensors on a small computer.
-Smoothed poses, which samples get, are judged at their own stamps; those within the lag are as known when the drive
-ends.
+Only localisation runs, because only poses are compared; `us_per_second` is its CPU cost, the paper's argument for cheap
+sensors on a small computer. Smoothed poses, used for samples, are judged at their own stamps; those within the lag are
+as known at the end.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from sitegrid.logs.replay import Score, replay, score
 from sitegrid.logs.sensors import UnsupportedError, select
 from sitegrid.proof.figures import Report, Row, half_width, rounded
 
-Scores = Mapping[Configuration, Sequence[Score]]  # of each row those of its drives
+Scores = Mapping[Configuration, Sequence[Score]]  # by row, then drive
 MEANS = (
     *("rmse_x_m", "rmse_y_m", "net_m", "nees", "coverage95", "covered"),
     *("smoothed_net_m", "smoothed_nees", "smoothed_coverage95"),
@@ -36,7 +35,7 @@ MEANS = (
 def run(
     runner: Runner, seeds: Sequence[int], seconds: float, rows: Sequence[Configuration], setup: Setup = PAPER
 ) -> tuple[Report, Scores]:
-    """Record, replay and score all configurations with all seeds; `missing`: those that the pipeline cannot run."""
+    """Record, replay and score all configurations and seeds; `missing`: unsupported ones."""
     drives = [PlannedDrive(seed, seconds, setup.preset, setup) for seed in seeds]
     rows = [as_recorded(row, drives[0]) for row in rows]
     refusals = {row: _why_not(drives[0].machine, row) for row in rows}
@@ -55,19 +54,19 @@ def run(
 
 
 def scored(runner: Runner, drives: Sequence[PlannedDrive], rows: Sequence[Configuration]) -> Scores:
-    """Replay and score rows on drives; of each row its scores, drive by drive."""
+    """Replay and score rows; scores of each row by drive."""
     runs = iter(runner.run(EXPERIMENT, [replay_task(row, drive) for drive in drives for row in rows]))
     by_drive = [{row: next(runs) for row in rows} for _ in drives]
     return {row: [each[row] for each in by_drive] for row in rows}
 
 
 def as_recorded(row: Configuration, drive: PlannedDrive) -> Configuration:
-    """A row with the share of slow GPS errors of a recording, where it names none."""
+    """A row with the recording's share of slow GPS errors by default."""
     return row if row.machine_share is not None else replace(row, machine_share=_gps(drive).machine_share)
 
 
 def gps_error(drive: PlannedDrive) -> Row:
-    """How slow the GPS errors of a drive are: on white noise every filter looks wonderful."""
+    """How slow a drive's GPS errors are: on white noise every filter looks good."""
     gps = _gps(drive)
     slow, white = gps.drift_std_m**2, gps.white_std_m**2
     return {
@@ -84,7 +83,7 @@ def _gps(drive: PlannedDrive) -> GpsNoise:
 
 
 def _why_not(machine: MachineConfig, row: Configuration) -> str:
-    """Why the pipeline cannot run a row; nothing if it can."""
+    """Why the pipeline cannot run a row, or empty."""
     try:
         select(machine, row.gps, row.imu)
     except UnsupportedError as error:
@@ -96,7 +95,7 @@ def _why_not(machine: MachineConfig, row: Configuration) -> str:
 
 
 def summarise(row: Configuration, scores: Sequence[Score]) -> Row:
-    """One row of the table: means over the seeds; beside their net error, the paper's."""
+    """Table row: means over seeds, and the paper's net error."""
     net, paper = values(scores, "net_m"), row.published_net_m
     summary = {
         **vars(row),
@@ -113,7 +112,7 @@ def summarise(row: Configuration, scores: Sequence[Score]) -> Row:
 
 
 def ratios(scores: Scores) -> list[Row]:
-    """Net errors over others on the same drives: of profiles, filters, receivers, smoothed over live."""
+    """Net error ratios on the same drives: profiles, filters, receivers, smoothed over live."""
     rows = []
     for row in scores:
         net, smoothed = values(scores[row], "net_m"), values(scores[row], "smoothed_net_m")
@@ -136,13 +135,13 @@ def ratios(scores: Scores) -> list[Row]:
 
 
 def paired_ratio(a: Floats, b: Floats) -> tuple[float, float | None]:
-    """Ratio of the means of paired values (n,), and the half-width of its 95 % interval (None of one pair)."""
+    """Ratio of means of paired values (n,), and its 95 % half-width (None for one pair)."""
     ratio = float(a.mean() / b.mean())
     return ratio, half_width((a - ratio * b) / b.mean())
 
 
 def nees_interval(scores: Sequence[Score]) -> list[float]:
-    """Interval of the mean NEES over independent runs: the half-widths of their intervals add as squares."""
+    """Interval of the mean NEES over independent runs; half-widths add in squares."""
     low, high = values(scores, "nees_low"), values(scores, "nees_high")
     middle, half = (low + high) / 2, (high - low) / 2
     width = float(np.sqrt((half**2).sum())) / len(scores)
@@ -169,9 +168,9 @@ def _replay(task: Task[Configuration], cache: Path) -> Score:
 
 
 def _with_share(task: Task[Configuration], cache: Path) -> RecordedDrive:
-    """The recording of a task, its fixes made anew where receivers share something else than they did.
+    """A task's recording, with new fixes if the receivers' share differs.
 
-    The seed of the errors is that of the drive: with the share that was recorded, they would be the recorded ones.
+    Errors are seeded by the drive: the recorded share gives the recorded errors.
     """
     recording, drive, share = task.recording(cache), task.drive, task.variant.machine_share
     assert drive

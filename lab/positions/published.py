@@ -1,6 +1,6 @@
-"""What the paper reports, Xiang et al., "Where am I? SLAM for Mobile Machines on A Smart Working Site".
+"""Figures of Xiang et al., "Where am I? SLAM for Mobile Machines on A Smart Working Site".
 
-A group is a filter with so many GPS receivers and IMUs; wheel encoders are always there.
+A group is a filter with numbers of GPS receivers and IMUs; wheel encoders are always used.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ import math
 from dataclasses import dataclass
 
 Group = tuple[str, int, int]  # filter, GPS receivers, IMUs
-PRINTED = 5e-4  # half of the last digit of its x and y [m]: nets may differ so much from them
+PRINTED = 5e-4  # half of the last printed digit [m], the tolerance of nets
 
 
 @dataclass(frozen=True)
 class Published:
-    """Root mean square errors of one group [m]; of a map, cells in a wrong class [%], of those that were plotted."""
+    """RMSE of one group [m]; of a map, wrong cells [%] among plotted ones."""
 
     rmse_x_m: float
     rmse_y_m: float
@@ -24,12 +24,12 @@ class Published:
 
     @property
     def net_of_parts_m(self) -> float:
-        """The net error that x and y make."""
+        """Net error from x and y."""
         return math.hypot(self.rmse_x_m, self.rmse_y_m)
 
     @property
     def is_consistent(self) -> bool:
-        """Whether x, y and net fit together, as far as they are printed."""
+        """Whether x, y and net agree as printed."""
         return abs(self.net_of_parts_m - self.net_m) <= 2 * PRINTED
 
 
@@ -52,7 +52,7 @@ POSITIONS: dict[Group, Published] = {
     ("ukf", 2, 3): Published(0.873, 1.098, 1.4024),
     ("ukf", 3, 3): Published(0.826, 0.933, 1.2458),
 }
-# Table 3 and the text below it: positions while plotting, and the maps, J_r and J_s.
+# Table 3 and its text: positions while plotting, maps' J_r and J_s.
 PLOTTING: dict[Group, Published] = {
     ("ekf", 1, 1): Published(2.584, 3.407, 4.4444, 2.389, 2.258),
     ("ukf", 1, 1): Published(2.003, 2.314, 3.0603, 1.482, 1.682),

@@ -1,6 +1,6 @@
-"""Recordings with other fixes: what an agent would have read on the same drive, had its receivers erred otherwise.
+"""Recordings with replaced fixes: the same drive with other receiver errors.
 
-The truth that makes them stays in this package; agents get readings and nothing else.
+The truth stays in this package; agents get readings only.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STEP_NS = 1_000_000_000 // BASE_RATE_HZ  # of the simulated world
 class TrueMotion:
     """True motion of `base_link` at n instants.
 
-    stamp_ns: (n,). position_m: (n, 3) in `map`. attitude_rad: roll, pitch, yaw (n, 3), without jumps.
+    stamp_ns: (n,). position_m: (n, 3) in `map`. attitude_rad: roll, pitch, yaw (n, 3), unwrapped.
     """
 
     stamp_ns: Ints
@@ -38,7 +38,7 @@ class TrueMotion:
     attitude_rad: Floats
 
     def antenna_m(self, sensor: SensorConfig, stamp_ns: Ints) -> Floats:
-        """Where an antenna truly is at other instants (m,): (m, 3) in `map`; NaN outside of the known ones."""
+        """True antenna position at other instants (m,): (m, 3) in `map`; NaN outside."""
         roll, pitch, yaw = interpolate(stamp_ns, self.stamp_ns, self.attitude_rad).T
         lever = np.broadcast_to(np.array(sensor.mount.xyz_m)[:, None], (3, len(stamp_ns)))
         antenna: Floats = (
@@ -49,9 +49,9 @@ class TrueMotion:
 
 @dataclass(frozen=True)
 class GpsErrors:
-    """Errors of one receiver at r instants, east, north and up (r, 3) each [m].
+    """Errors of one receiver at r instants, east, north, up (r, 3) each [m].
 
-    stamp_ns: (r,), all instants at which it reads, silent or not. stated_m2: the variances (3,) that it states.
+    stamp_ns: (r,), all reading instants, silent or not. stated_m2: stated variances (3,).
     """
 
     stamp_ns: Ints
@@ -61,11 +61,11 @@ class GpsErrors:
 
     @property
     def total_m(self) -> Floats:
-        """What a fix is off (r, 3)."""
+        """Error of a fix (r, 3)."""
         return self.slow_m + self.white_m
 
     def rows(self, stamp_ns: Ints) -> Ints:
-        """Which instants these stamps (m,) are (m,); ValueError where one is none of them."""
+        """Indices (m,) of these stamps (m,); ValueError for an unknown one."""
         rows = np.searchsorted(self.stamp_ns, stamp_ns).clip(max=len(self.stamp_ns) - 1)
         if (self.stamp_ns[rows] != stamp_ns).any():
             raise ValueError("a receiver was read between its instants: another rate, or a faulty clock")
@@ -73,7 +73,7 @@ class GpsErrors:
 
 
 def true_motion(folder: Path) -> TrueMotion:
-    """The true motion of a recording's machine; folder: of the recording."""
+    """True motion of a recording's machine; folder: of the recording."""
     table = np.genfromtxt(track_file(folder), delimiter=",", names=True, dtype=None)
     angles = [np.unwrap(table[name]) for name in ("roll", "pitch", "yaw")]
     position_m = np.stack([table[name] for name in "xyz"], axis=1)
@@ -83,11 +83,10 @@ def true_motion(folder: Path) -> TrueMotion:
 def gps_errors(
     machine: MachineConfig, noise: GpsNoise, seed: int, until_ns: int, number: int = 0
 ) -> dict[str, GpsErrors]:
-    """Fresh errors of a machine's receivers, by their names, from the start of a simulation until a stamp.
+    """New errors of a machine's receivers by name, from a simulation's start to a stamp.
 
-    noise: of each receiver, as a preset has it; `machine_share` and `site_share` are in it. number: the machine's place
-    in the fleet. Machines of one seed and different numbers have `site_share` of the slow variance
-    in common. The model is the simulator's: with its seed and number come its errors.
+    noise: of each receiver, with `machine_share` and `site_share`. number: index in the fleet; machines of one seed
+    share `site_share` of the slow variance. The model is the simulator's: same seed and number, same errors.
     """
     receivers = [s for s in machine.sensors if s.kind == "gps"]
     if not receivers:
@@ -102,9 +101,9 @@ def gps_errors(
 
 
 def with_gps_errors(recording: RecordedDrive, motion: TrueMotion, errors: Mapping[str, GpsErrors]) -> RecordedDrive:
-    """The recording with fixes of the true antennas and these errors; receivers are silent where they were.
+    """The recording with fixes at true antennas plus these errors; silences are kept.
 
-    errors: by receiver; fixes of others stay.
+    errors: by receiver; other fixes stay.
     """
     projection = Projection(recording.site)
     fixes: dict[tuple[str, int], Gps] = {}

@@ -1,1 +1,1 @@
-"""Accuracy of roads, traffic and the worklist, on a haul road with random patches of soil."""
+"""Accuracy of roads, traffic and worklist on a haul road with random soil patches."""

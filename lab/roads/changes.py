@@ -1,7 +1,6 @@
-"""Detection of changed ground as precision, recall and delay: of segments, of cells, and of cells read with `repairs`.
+"""Change detection as precision, recall, delay: of segments, cells, and cells read with `repairs`.
 
-The map is looked at every STEP_S while the samples of a recording come in by their stamps, so that a delay says when
-the evidence showed a change, not when a link brought it.
+The map is read every STEP_S while samples arrive by stamp, so delays measure evidence, not links.
 """
 
 from __future__ import annotations
@@ -34,20 +33,20 @@ from sitegrid.proof.figures import Row
 from sitegrid.proof.map_score import TRACK_STEP_M
 
 SEGMENTS, CELLS, CELLS_REPAIRS = "segments", "cells", "cells, repairs"
-STEP_S = 15.0  # between two maps over time
-PASSES = (1, 2, 3)  # since a change, at least
-ALARM_CELLS = 6  # nearer to ground that changed than that, what is said to have changed is no false alarm
+STEP_S = 15.0  # between maps over time
+PASSES = (1, 2, 3)  # least passes since a change
+ALARM_CELLS = 6  # distance from changed ground within which a reported change is no false alarm
 DAY_S = 86_400.0
 CELL_M = 1.0
 
 
 @dataclass(frozen=True)
 class Changes:
-    """What of one recording changed, and what was said. kind: which places.
+    """True and reported changes of one recording. kind: of places.
 
-    Lists are of the places that truly changed and were driven before and since: passes: how many since; needed: how
-    many until it was shown, and minutes: from the first of them, None for never. said: how many places are said to have
-    changed in the end; right: how many of them did. km2_days: known area times the time of the recording.
+    Lists cover changed places driven before and since. passes: since the change; needed: until shown; minutes: from the
+    first, None: never. said: places finally reported; right: of them truly changed. km2_days: known area times
+    duration.
     """
 
     kind: str
@@ -61,7 +60,7 @@ class Changes:
 
 
 def pooled(parts: Sequence[Changes]) -> Row:
-    """Figures of the same kind of place in several recordings."""
+    """Figures of one kind of place over several recordings."""
     each = [item for part in parts for item in zip(part.passes, part.needed, part.minutes, strict=True)]
     said, alarms = sum(part.said for part in parts), sum(part.false_alarms for part in parts)
     km2_days = sum(part.km2_days for part in parts)
@@ -98,21 +97,21 @@ def _percent(part: int, whole: int) -> float | None:
 
 @dataclass(frozen=True)
 class ChangedGround:
-    """The cells of a site. changed (rows, columns): whether their soil is another one since half time."""
+    """A site's cells. changed (rows, columns): soil changed at half time."""
 
     window: CellWindow
     changed: Bools
 
     @classmethod
     def of_drive(cls, drive: RoadDrive, scene: Scene, cache: Path) -> ChangedGround:
-        """That of a recording."""
+        """From a recording."""
         ground = load_scenario(str(drive.folder(cache) / "scenario.toml")).ground
         before, after = true_ground(ground, drive.seed).truth.c_rr, scene.truth.c_rr
         return cls(window_of(scene.truth), np.maximum(before / after, after / before) > UNTOUCHED)
 
 
 def changes(recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs, ground: ChangedGround) -> list[Changes]:
-    """Of segments, of cells as they are read usually, and of cells with `repairs`."""
+    """Changes of segments, of cells as read by default, and of cells with `repairs`."""
     half_ns, window = recorded.half_ns, ground.window
     shape = (window.rows, window.columns)
     far = cv2.dilate(ground.changed.astype(np.uint8), np.ones((2 * ALARM_CELLS + 1,) * 2, np.uint8)) == 0
@@ -134,7 +133,7 @@ def changes(recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs, groun
 def maps_of_changes(
     recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs, window: CellWindow, grid: Grid
 ) -> Iterator[tuple[int, dict[str, Bools]]]:
-    """Fold a recording into a grid; every STEP_S, a stamp and which cells (rows, columns) are said to have changed."""
+    """Fold a recording; every STEP_S yields a stamp and the cells (rows, columns) reported as changed."""
     config = ServerConfig()
     rows = np.concatenate(list(recorded.rows.values()))
     hashes = np.array([name_hash(name) for name in recorded.rows], np.uint64)
@@ -158,7 +157,7 @@ def _known_km2(grid: Grid, window: CellWindow) -> float:
 
 
 def _said(pages: Pages, window: CellWindow, known: Ages, config: ServerConfig) -> Bools:
-    """Cells that the layer `changed_s` has a value of."""
+    """Cells with a value of `changed_s`."""
     out = np.zeros((window.rows, window.columns), np.float32)
     for block, first in valid_pages(pages, CELL_M, config.change, known).items():
         place(out, window, block, first > 0)
@@ -184,11 +183,11 @@ def _of_segments(seen: SegmentRepairs, km2_days: float) -> Changes:
 def _of_cells(
     kind: str, since_ns: Ints, false: Bools, passes: CellPasses, ground: ChangedGround, half_ns: int, km2_days: float
 ) -> Changes:
-    """since_ns (rows, columns): from when on cells were said to have changed, to the end; 0 for those that are not."""
+    """since_ns (rows, columns): start of the final report of change; 0: none."""
     since, later = since_ns.ravel(), passes.begin_ns >= half_ns
     driven = [np.bincount(passes.cell[some], minlength=len(since)) for some in (~later, later)]
     until = later & (passes.end_ns <= since[passes.cell])
-    needed = np.maximum(np.bincount(passes.cell[until], minlength=len(since)), 1)  # a neighbour's evidence may be first
+    needed = np.maximum(np.bincount(passes.cell[until], minlength=len(since)), 1)  # a neighbour's evidence may lead
     first_ns = np.full(len(since), np.iinfo(np.int64).max)
     np.minimum.at(first_ns, passes.cell[later], passes.end_ns[later])
     cells = np.flatnonzero(ground.changed.ravel() & (driven[0] > 0) & (driven[1] > 0))
@@ -209,9 +208,9 @@ def _of_cells(
 
 @dataclass(frozen=True)
 class CellPasses:
-    """True passes (n,) over cells: number of the cell, row by row; when a load centre came to it, and when it left it.
+    """True passes (n,) over cells: cell number, row by row; arrival and departure of a load centre.
 
-    What one machine drives on a cell within a minute is one, as the map counts visits.
+    A machine's drives on a cell within a minute are one pass, as in the map's visits.
     """
 
     cell: Ints
@@ -220,13 +219,13 @@ class CellPasses:
 
     @classmethod
     def of_tracks(cls, tracks: Iterable[TrueTrack], window: CellWindow) -> CellPasses:
-        """Those of machines in a window."""
+        """Passes of machines in a window."""
         parts = [_passes(track, window) for track in tracks]
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def _passes(track: TrueTrack, window: CellWindow) -> tuple[Ints, Ints, Ints]:
-    """One machine's, as CellPasses has them: stays on cells, of which those of the same minute are joined."""
+    """One machine's passes: stays on cells, joined within a minute."""
     driven_m = np.cumsum(track.step_m)
     at_m = np.arange(0.0, driven_m[-1] + TRACK_STEP_M, TRACK_STEP_M)
     column, row = (

@@ -1,4 +1,4 @@
-"""Recordings of fleets on roads with random patches of soil, some of which are repaired half-way."""
+"""Recordings of fleets on roads with random soil patches, some repaired at half time."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ SHARES = (0.1, 0.15, 0.35, 0.25, 0.15)  # of the patches
 LENGTH_M, GAP_M = (8.0, 60.0), (0.0, 50.0)  # of a patch along the route, and to the next
 HALF_WIDTH_M = 14.0
 CORNER_M = 4.0  # between corners of an outline
-# Patches of these soils may be repaired, to this one: c_rr falls by factors of 2 and 3.
+# Repairable soils, and their repair: c_rr falls by factors of 2 and 3.
 BAD, REPAIRED = ("dry dirt", "wet dirt"), "gravel"
 REPAIRS = 0.5  # share of the bad patches
 
 
 @dataclass(frozen=True)
 class RoadDrive(FleetDrive):
-    """All machines of a scenario, on patches of soil drawn from the seed. repairs: whether some change at half time."""
+    """A scenario's machines on soil patches drawn from the seed. repairs: some change at half time."""
 
     repairs: bool = False
 
     @property
     def scenario_toml(self) -> str:
-        """The scenario file of this drive."""
+        """Scenario file."""
         ground = load_scenario(self.setup.scenario).ground
         patches, repaired = self._patches()
         table = {**asdict(ground), "zone": [asdict(zone) for zone in (*ground.zone, *patches)]}
@@ -40,11 +40,11 @@ class RoadDrive(FleetDrive):
         return "\n".join(f"{name} = {inline(value)}" for name, value in top.items()) + "\n"
 
     def agent(self, index: int) -> Agent:
-        """The agent of a machine."""
+        """A machine's agent."""
         return Agent(index, closed_tours=True)
 
     def _patches(self) -> tuple[list[ZoneConfig], list[ZoneConfig]]:
-        """Patches along all routes, and those that are repaired, as they are then."""
+        """Patches along all routes, and repaired ones in their later state."""
         draw = np.random.default_rng([self.seed, 21])
         patches: list[ZoneConfig] = []
         for route in load_scenario(self.setup.scenario).route:
@@ -59,13 +59,13 @@ class RoadDrive(FleetDrive):
 
 
 def planned(scenario: str, seed: int, seconds: float, *, repairs: bool = False) -> RoadDrive:
-    """A drive of a scenario with the sensors that its file has."""
+    """Drive of a scenario with its own sensors."""
     preset = load_scenario(scenario).fleet[0].preset
     return RoadDrive(seed, seconds, preset, Setup(scenario, (), (), ()), repairs=repairs)
 
 
 def _along(points: Floats, spacing_m: float, draw: np.random.Generator) -> list[ZoneConfig]:
-    """Patches that lie across a line, one behind the other."""
+    """Consecutive patches across a line."""
     out, at_m, end_m = [], draw.uniform(*GAP_M), (len(points) - 1) * spacing_m
     while at_m < end_m:
         length_m = draw.uniform(*LENGTH_M)

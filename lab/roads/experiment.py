@@ -1,4 +1,4 @@
-"""Roads, traffic, losses and repairs, by whole pipelines on recordings whose ground has random patches of soil."""
+"""Roads, traffic, losses and repairs from whole pipelines on random soil patches."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from lab.roads.repairs import SegmentRepairs, repair_figures
 from lab.roads.score import Recorded, kept_after, road_figures, roads, traffic_figures
 from sitegrid.proof.figures import Report, Row, rounded
 
-REPAIRS_S = 1500.0 / 900.0  # times as long as the other recordings: passes before, and after
+REPAIRS_S = 1500.0 / 900.0  # recording length relative to others: passes before and after
 DIGITS = 3
-CELLS_SHOWN = ("changed", "since")  # of the cells of repaired segments, those that show it
+CELLS_SHOWN = ("changed", "since")  # read options that show cells of repaired segments
 
 
 @dataclass(frozen=True)
 class RoadCase:
-    """What a row shows: a scenario, with repairs half-way or without."""
+    """A row: a scenario, with repairs at half time or without."""
 
     name: str
     scenario: str
     repairs: bool = False
 
     def drive(self, seed: int, seconds: float) -> RoadDrive:
-        """The recording of a seed."""
+        """Recording of a seed."""
         return planned(self.scenario, seed, seconds * (REPAIRS_S if self.repairs else 1.0), repairs=self.repairs)
 
 
@@ -47,7 +47,7 @@ CASES = (
 
 @dataclass(frozen=True)
 class Judging:
-    """One recording of a case to be judged. seconds: of the case. other: seed of another day on the same roads."""
+    """A recording to judge. seconds: of the case. other: seed of another day on the same roads."""
 
     case: RoadCase
     seconds: float
@@ -55,22 +55,22 @@ class Judging:
 
     @property
     def name(self) -> str:
-        """Short and unique."""
+        """Short unique name."""
         return self.case.name
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Figures of one recording, by name. changes: `Changes` as plain values, of repairs alone."""
+    """Figures of one recording by name. changes: `Changes` as plain values, with repairs only."""
 
     figures: dict[str, float]
     changes: list[Row] = field(default_factory=list)
 
 
 def run(runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[RoadCase] = CASES) -> tuple[Report, None]:
-    """Record, replay, calibrate and judge all cases with all seeds; a row per case, medians or sums over the seeds.
+    """Record, replay, calibrate and judge all cases and seeds; a row per case, medians or sums.
 
-    Case by case, each seed judged as it is replayed, so that a run that is broken off has whole rows to go on from.
+    Case by case with each seed judged at once, so that interrupted runs resume with whole rows.
     """
     table, detected = [], []
     for case in cases:
@@ -89,7 +89,7 @@ def run(runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[Ro
 
 
 def agent_tasks(drive: RoadDrive) -> list[Task[Agent]]:
-    """All machines of a recording, replayed."""
+    """Replays of all machines of a recording."""
     return [replay_task(drive.agent(index), drive) for index in range(drive.machines)]
 
 
@@ -101,7 +101,6 @@ def _recorded(drive: RoadDrive, cache: Path) -> Recorded:
 
 
 def _solve(task: Task[Judging], cache: Path) -> Judged:
-    """Judge one recording."""
     what = task.variant
     drive = what.case.drive(task.seed, what.seconds)
     recorded = _recorded(drive, cache)
@@ -122,7 +121,7 @@ EXPERIMENT = Experiment("roads", Judged, _solve)
 
 
 def row_of(case: RoadCase, by_seed: Sequence[Row]) -> Row:
-    """Medians over the seeds; of repairs, sums and shares of them."""
+    """Medians over seeds; for repairs sums and their ratios."""
     if not case.repairs:
         return rounded(summary({"case": case.name}, by_seed, median), DIGITS)
     total = {name: sum(column(by_seed, name)) for name in by_seed[0]}
@@ -137,6 +136,6 @@ def row_of(case: RoadCase, by_seed: Sequence[Row]) -> Row:
 
 
 def change_rows(by_seed: Sequence[Sequence[Row]]) -> list[Row]:
-    """A row for each kind of place, of all seeds; none where nothing was repaired."""
+    """A row per kind of place over all seeds; none without repairs."""
     kinds = zip(*([Changes(**row) for row in own] for own in by_seed), strict=True)
     return [rounded(pooled(of_kind), DIGITS, km2_days=8) for of_kind in kinds]

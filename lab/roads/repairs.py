@@ -1,4 +1,4 @@
-"""Repairs of segments: which were seen, after how many true passes, the work that they save, and their cells."""
+"""Repairs of segments: detected ones, true passes needed, work saved, cells."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from mapserver.roads.tally import Tally
 from protocol.arrays import Floats, Ints
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-CHANGED = (1.5, 4.0)  # factors of c_rr that a repair is judged by
-UNTOUCHED = 1.1  # less is no change: its share of a segment lies at a border
-SEEN = (2, 3)  # passes after which a repair should be seen
+CHANGED = (1.5, 4.0)  # judged factors of c_rr
+UNTOUCHED = 1.1  # smaller factors are no change: border effects
+SEEN = (2, 3)  # passes after which a repair should be detected
 
 
 @dataclass(frozen=True)
 class TrueRepair:
-    """A segment whose ground was repaired at half time.
+    """A segment repaired at half time.
 
-    passes_ns: when machines had passed since, in order; shown_ns: when the pass ended that showed it, None for never.
+    passes_ns: machines' passes since, sorted. shown_ns: end of the revealing pass, None: never.
     """
 
     segment: int
@@ -39,15 +39,15 @@ class TrueRepair:
 
     @property
     def needed(self) -> int | None:
-        """How many true passes there were until, and with, the one that showed it."""
+        """True passes up to the revealing one."""
         return None if self.shown_ns is None else int((self.passes_ns <= self.shown_ns).sum())
 
 
 @dataclass(frozen=True)
 class SegmentRepairs:
-    """What happened to the ground of segments at half time, and what was shown.
+    """True and reported changes of segments at half time.
 
-    shown: changes, by segment; false: those where there was none; looks: at passes. halves: what is true of both.
+    shown: changes by segment; false: untrue ones; looks: checked passes. halves: truth of both halves.
     """
 
     shown: list[Repair]
@@ -58,7 +58,7 @@ class SegmentRepairs:
 
     @classmethod
     def of_recording(cls, recorded: Recorded, whole: SegmentTable) -> SegmentRepairs:
-        """Those of a recording, on the roads of all of it."""
+        """From a recording, on its final roads."""
         ledgers, kept = Ledgers(whole), PassTally()
         for name, table in recorded.rows.items():
             kept.add(table, np.full(len(table), name_hash(name), np.uint64))
@@ -82,9 +82,9 @@ class SegmentRepairs:
 
 
 def shown_at(later: Mapping[str, Ints], machines: Collection[str], seen: int | None) -> int | None:
-    """When the true pass ended that showed a change: in this minute, by one of these; the minute's end where none did.
+    """End of the true pass that revealed a change in minute `seen` by one of these machines, else the minute's end.
 
-    later: stamps at which each machine had passed, after the change.
+    later: each machine's pass stamps after the change.
     """
     if seen is None:
         return None
@@ -93,7 +93,7 @@ def shown_at(later: Mapping[str, Ints], machines: Collection[str], seen: int | N
 
 
 def repair_figures(recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs) -> dict[str, float]:
-    """Counts of repairs and of false alarms, and the work that they save an hour [J], known and true."""
+    """Counts of repairs and false alarms; hourly work saved [J], known and true."""
     before, after = seen.halves
     judged = [each for each in seen.true if len(each.passes_ns) > SEEN[-1]]
     repaired = [each.segment for each in seen.true]
@@ -115,9 +115,9 @@ def repair_figures(recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs
 def _cells_shown(
     recorded: Recorded, whole: SegmentTable, shown: Sequence[Repair], true: tuple[Floats, Floats], judged: Sequence[int]
 ) -> dict[str, float]:
-    """How many cells judged segments have, and how many are nearer to what is true after the repair than to before.
+    """Cells of judged segments, and those closer to the repaired than to the former truth.
 
-    changed: read by changes of cells alone; since: as well as by those of segments.
+    changed: read by changes of cells only; since: also by those of segments.
     """
     grid, config = grid_of(recorded.rows), ServerConfig()
     everything = [Repair(segment, 1, 1, 0.0, 0.0) for segment in judged]

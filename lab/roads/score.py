@@ -1,4 +1,4 @@
-"""Figures of one recording: roads against what was driven, ledger and losses against what is true of segments."""
+"""Figures of one recording: roads against drives, ledger and losses against segments' truth."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from sim.recorder import TRACKS_FOLDER
 
 @dataclass(frozen=True)
 class TrueTrack:
-    """One machine's load centre at n instants: place (n, 2), direction of travel, and what the simulator has there.
+    """One load centre at n instants: place (n, 2), direction of travel, and simulated truth.
 
-    c_rr: of the ground below the wheels, by their loads; ground_c_rr: below the load centre, as it is in the end.
+    c_rr: below the wheels, weighted by load; ground_c_rr: below the load centre, final state.
     """
 
     stamp_ns: Ints
@@ -48,7 +48,7 @@ class TrueTrack:
 
 @dataclass(frozen=True)
 class TrueTraffic:
-    """Of segments (k,): metres (k, 2) by direction, mean c_rr over places, work lost [J]; both c_rr as of a track."""
+    """By segment (k,): metres (k, 2) by direction, mean c_rr over places, work lost [J]; both c_rr as in TrueTrack."""
 
     metres: Floats
     c_rr: Floats
@@ -57,7 +57,7 @@ class TrueTraffic:
 
 
 def true_tracks(drive: FleetDrive, scene: Scene, cache: Path) -> dict[str, TrueTrack]:
-    """The tracks of all machines of a recording."""
+    """Tracks of all machines of a recording."""
     out, truth = {}, scene.truth
     for name, track in scene.tracks.items():
         path = drive.folder(cache) / "truth" / TRACKS_FOLDER / f"{name}.csv"
@@ -75,7 +75,7 @@ def true_tracks(drive: FleetDrive, scene: Scene, cache: Path) -> dict[str, TrueT
 def true_traffic(
     tracks: Iterable[TrueTrack], ledgers: Ledgers, target: float, from_ns: int = 0, to_ns: int = 2**62
 ) -> TrueTraffic:
-    """What was driven on segments from a stamp to another."""
+    """Traffic on segments between two stamps."""
     count, ends = len(ledgers.segments.ids), ledgers.slices
     metres, work = np.zeros((count, 2)), np.zeros(count)
     slices = np.zeros((3, int(ends[-1])))
@@ -96,7 +96,7 @@ def true_traffic(
 
 
 def true_passes(track: TrueTrack, ledgers: Ledgers, segment: int, from_ns: int) -> Ints:
-    """Stamps at which a machine had passed over half of a segment or more, from a stamp on."""
+    """Stamps of passes over at least half a segment, from a stamp on."""
     later = track.stamp_ns >= from_ns
     inside = ledgers.place(track.place_m[later], track.heading_rad[later]).segment == segment
     begins = np.flatnonzero(np.diff(inside.astype(np.int64), prepend=0) == 1)
@@ -111,11 +111,11 @@ def true_passes(track: TrueTrack, ledgers: Ledgers, segment: int, from_ns: int) 
 
 TARGET = 0.02
 NEAR_M = 3.0  # of a road
-SPACING_M = 0.5  # of points on roads that are looked at
-LEAST_PASSES = 1.5  # true ones, for a segment to be judged
+SPACING_M = 0.5  # point spacing on roads
+LEAST_PASSES = 1.5  # true passes for a segment to be judged
 TOP = 10
-SHARE_OFF = 0.1  # of metres that go in one direction: more is the wrong direction
-STEP_M = 0.02  # in a tenth of a second: a machine that moves
+SHARE_OFF = 0.1  # of metres in one direction; more is the wrong direction
+STEP_M = 0.02  # per tenth of a second, for a moving machine
 EVERYWHERE = CellWindow(-20_000, -20_000, 40_000, 40_000)
 
 
@@ -130,7 +130,7 @@ class Recorded:
 
     @classmethod
     def of_drive(cls, drive: FleetDrive, rows: Rows, scene: Scene, cache: Path, *, calibrates: bool = True) -> Recorded:
-        """What was recorded, with the corrections that the server's solver makes of it, or without."""
+        """From a recording, corrected by the server's solver or not."""
         solved, config = calibrated(rows) if calibrates else None, FoldConfig()
         right = {name: corrected(table, of_machine(solved, name)) if solved else table for name, table in rows.items()}
         right = {name: table[is_foldable(table, config)] for name, table in right.items()}
@@ -140,11 +140,11 @@ class Recorded:
 
     @property
     def half_ns(self) -> int:
-        """Half of it."""
+        """Its middle."""
         return (self.start_ns + self.end_ns) // 2
 
     def part(self, from_ns: int = 0, to_ns: int = 2**62, machines: Collection[str] = ()) -> Rows:
-        """Samples of a time, and of some machines."""
+        """Samples of a time span, and of some machines."""
         return {
             name: rows[(rows["stamp_ns"] >= from_ns) & (rows["stamp_ns"] < to_ns)]
             for name, rows in self.rows.items()
@@ -153,7 +153,7 @@ class Recorded:
 
 
 def grid_of(rows: Rows) -> Grid:
-    """The evidence that a server would have."""
+    """A server's evidence."""
     grid = Grid(1.0, FoldConfig())
     for name, table in rows.items():
         grid.fold(table, name)
@@ -161,7 +161,7 @@ def grid_of(rows: Rows) -> Grid:
 
 
 def roads(rows: Rows) -> SegmentTable:
-    """The roads that a server would have."""
+    """A server's roads."""
     grid = grid_of(rows)
     blocks = grid.blocks_in(EVERYWHERE)
     pages = dict(zip(blocks, grid.pages(blocks), strict=True))
@@ -169,7 +169,7 @@ def roads(rows: Rows) -> SegmentTable:
 
 
 def tally_of(rows: Rows) -> Tally:
-    """What drove."""
+    """Sum up the traffic."""
     out = Tally()
     for name, table in rows.items():
         out.add(table, np.full(len(table), name_hash(name), np.uint64))
@@ -177,7 +177,7 @@ def tally_of(rows: Rows) -> Tally:
 
 
 def road_figures(recorded: Recorded, whole: SegmentTable) -> dict[str, float]:
-    """Percent of what was driven that is near a road, of roads that nobody drove, of length that keeps its name."""
+    """Percent of drives near a road, of roads never driven, of length that keeps its name."""
     driven = np.concatenate([track.place_m[track.step_m > STEP_M] for track in recorded.tracks.values()])
     lines = np.concatenate([_dense(whole.line(i)) for i in range(len(whole.ids))])
     off_m, _ = cKDTree(lines).query(driven)
@@ -195,7 +195,7 @@ def road_figures(recorded: Recorded, whole: SegmentTable) -> dict[str, float]:
 
 
 def kept_after(recorded: Recorded, later: Recorded, whole: SegmentTable) -> float:
-    """Percent of the length of roads that keeps its names once another day is in the map, with other ground."""
+    """Percent of road length that keeps its names after another day on other ground."""
     names = recorded.rows.keys() | later.rows.keys()
     after_ns = DAY_NS + recorded.start_ns - later.start_ns
     both = {}
@@ -217,7 +217,7 @@ def _dense(line: Floats) -> Floats:
 
 
 def _kept(part: SegmentTable, whole: SegmentTable) -> float:
-    """Percent of the length of a part's roads that has its names in the whole map too."""
+    """Percent of a partial map's road length with names of the whole map."""
     names = set(whole.ids)
     kept = np.array([name in names for name in part.ids])
     return 100.0 * float(part.length_m[kept].sum() / part.length_m.sum())
@@ -248,23 +248,22 @@ def traffic_figures(recorded: Recorded, whole: SegmentTable) -> dict[str, float]
 
 
 def judged_segments(true: TrueTraffic, whole: SegmentTable) -> Bools:
-    """Segments (k,) that were driven often enough."""
+    """Segments (k,) driven often enough."""
     return np.asarray(true.metres.sum(axis=1) > LEAST_PASSES * whole.length_m, np.bool_)
 
 
 def _list_figures(known: Losses, true: TrueTraffic, judged: Bools) -> dict[str, float]:
     """Order and sum of losses.
 
-    tau: with ties in the truth and the list; tau_ranks: the list's ties are its ranks; tau_plain: with ties in the
-    truth alone; tau_plain_most: that of the true losses themselves, as nothing without ties can be in order with what
-    has.
+    tau: ties in truth and list; tau_ranks: list ties are its ranks; tau_plain: ties in the truth only; tau_plain_most:
+    its upper bound, from the true losses, since an order without ties cannot match one with ties.
     """
     own, right = known.work_j[judged], true.work_j[judged]
     best, listed = np.argsort(-right)[:TOP], np.argsort(-own, kind="stable")[:TOP]
     own_tie, tie = (TIE_SHARE * work.max(initial=0.0) for work in (own, right))
     ranks, shown = np.full(len(judged), np.inf), ranked(known)
     ranks[shown.order] = shown.rank
-    place = -np.minimum(ranks, len(ranks) + 1)[judged]  # those that are not in the list are the last ones, alike
+    place = -np.minimum(ranks, len(ranks) + 1)[judged]  # unlisted segments tie at the end
     return {
         "tau": kendall(own, right, own_tie, tie),
         "tau_ranks": kendall(place, right, 0.0, tie),
@@ -276,7 +275,7 @@ def _list_figures(known: Losses, true: TrueTraffic, judged: Bools) -> dict[str, 
 
 
 def kendall(one: Floats, other: Floats, one_tie: float, other_tie: float) -> float:
-    """Kendall's tau-b of two orders, in which values that differ by less are ties."""
+    """Kendall's tau-b of two orders; values closer than a tie's width are tied."""
     i, j = np.triu_indices(len(one), 1)
     signs = []
     for values, tie in ((one, one_tie), (other, other_tie)):

@@ -1,1 +1,1 @@
-"""Accuracy of routes against what machines truly spent, and of cheapest ways against a finer search and the truth."""
+"""Accuracy of routes against work truly spent, and of cheapest ways against a finer search."""

@@ -1,4 +1,4 @@
-"""Routes and ways judged: by whole pipelines on recordings whose ground has random patches, and on drawn maps."""
+"""Routes and ways judged: whole pipelines on random soil patches, and drawn maps."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from lab.routes import ways
 from lab.routes.legs import judged_legs, seed_figures
 from sitegrid.proof.figures import Report, Row, rounded
 
-LONGER = 4.0 / 3.0  # times as long as the others: the check on how people drive
+LONGER = 4.0 / 3.0  # relative recording length: the check on driving style
 DIGITS = 2
 
 
 @dataclass(frozen=True)
 class RouteCase:
-    """What a row shows: a scenario. longer: as many times as long as the others; 0 of ways on drawn maps."""
+    """A row: a scenario. longer: relative recording length; 0: ways on drawn maps."""
 
     name: str
     longer: float = 1.0
 
     def drive(self, seed: int, seconds: float) -> RoadDrive:
-        """The recording of a seed: that of `python -m lab roads`, where it has the same length."""
+        """Recording of a seed, shared with `python -m lab roads` at equal length."""
         return planned(self.name, seed, seconds * self.longer)
 
 
@@ -39,13 +39,13 @@ CASES = (
     RouteCase("paper_site_driven", LONGER),
     RouteCase("ways", 0.0),
 )
-WORST = ("energy_pct", "back_pct", "time_pct")  # of which the worst seed is judged, too
+WORST = ("energy_pct", "back_pct", "time_pct")  # the worst seed is judged too
 
 
 def run(
     runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[RouteCase] = CASES
 ) -> tuple[Report, None]:
-    """Record, replay, calibrate and judge; a row per case. Ways are asked on maps drawn from the first seed."""
+    """Record, replay, calibrate and judge; a row per case. Ways use maps drawn from the first seed."""
     wanted = [case for case in cases if case.longer]
     tasks = {
         (case, seed, index): replay_task(Agent(index, closed_tours=True), case.drive(seed, seconds))
@@ -71,7 +71,7 @@ def run(
 
 
 def row_of(name: str, by_seed: Sequence[Row]) -> Row:
-    """Medians over the seeds, sums of what was driven, and `max_...`, of the worst seed."""
+    """Medians over seeds, sums of drives, and `max_...` of the worst seed."""
     sums = {key: float(sum(column(by_seed, key))) for key in ("legs", "drives", "km")}
     worst = {f"max_{key}": max(column(by_seed, key)) for key in WORST}
     return rounded(summary({"case": name}, by_seed, median, **sums, **worst), DIGITS)

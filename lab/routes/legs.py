@@ -1,4 +1,4 @@
-"""What machines drove from stop to stop or once around a tour, and its route by the map and by the true map."""
+"""Drives from stop to stop or around a tour, with their routes on map and true map."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from sim.truth import WORK
 from sitegrid.proof.figures import root_mean_square
 from sitegrid.proof.tracks import LoadTrack
 
-LEAST_M = 100.0  # a shorter drive between two stops is manoeuvring
+LEAST_M = 100.0  # shorter drives between stops are manoeuvring
 STANDING_MPS = 0.05
-POINT_M = 1.0  # between points of a line: nearer ones, where a machine all but stands, have no direction
-BACK_M, ALIGNED = 3.0, 0.7  # a tour is closed where its begin is so near, and the cosine of headings above
+POINT_M = 1.0  # point spacing of lines: closer points, near standstill, have no direction
+BACK_M, ALIGNED = 3.0, 0.7  # a tour closes at this distance with at least this cosine of headings
 
 
 @dataclass(frozen=True)
 class Leg:
-    """One drive. line_m (k, 2): of the load centre. machine: with the mass that its samples state.
+    """One drive. line_m (k, 2): of the load centre. machine: with the mass stated by samples.
 
-    stops: whether it stood before and after. energy_j: what the engine did; time_s: what it took.
+    stops: standing before and after. energy_j: engine work; time_s: duration.
     """
 
     line_m: Floats
@@ -51,7 +51,7 @@ class Leg:
 
 
 def legs_of(drive: FleetDrive, scene: Scene, samples: dict[str, Table], cache: Path) -> list[Leg]:
-    """All complete legs of a recording, of machines that drive ahead."""
+    """All complete forward legs of a recording."""
     legs = []
     for fleet in load_scenario(drive.setup.scenario).fleet:
         for name, track in scene.tracks.items():
@@ -93,7 +93,7 @@ def _spans(table: Table, track: LoadTrack) -> Iterator[tuple[int, int, tuple[boo
 
 
 def _laps(track: LoadTrack, begin: int, end: int) -> Iterator[tuple[int, int]]:
-    """Whole turns of a closed tour, one after another, from where it is at full speed on."""
+    """Complete laps of a closed tour, starting at full speed."""
     first = int(np.searchsorted(track.driven_m, track.driven_m[begin] + LEAST_M))
     while first < end:
         on = np.arange(first, end)
@@ -102,14 +102,14 @@ def _laps(track: LoadTrack, begin: int, end: int) -> Iterator[tuple[int, int]]:
         near = far[(off_m < BACK_M) & (np.cos(track.yaw_rad[far] - track.yaw_rad[first]) > ALIGNED)]
         if not near.size:
             return
-        again = near[: 1 + int(np.argmax(np.diff(near, append=end + 2) > 1))]  # the first time that it comes by
+        again = near[: 1 + int(np.argmax(np.diff(near, append=end + 2) > 1))]  # first return
         last = int(again[np.hypot(*(track.place_m[again] - track.place_m[first]).T).argmin()])
         yield first, last
         first = last
 
 
 def _stated_kg(samples: Table, span_ns: Ints, described_kg: float) -> float:
-    """Median of the mass that samples of a time state; where none does, what the machine is described with."""
+    """Median mass stated by a span's samples, else the described mass."""
     own = samples["mass_kg"][(samples["stamp_ns"] >= span_ns[0]) & (samples["stamp_ns"] <= span_ns[1])]
     known = own[np.isfinite(own)]
     return float(np.median(known)) if known.size else described_kg
@@ -119,12 +119,12 @@ def _stated_kg(samples: Table, span_ns: Ints, described_kg: float) -> float:
 
 
 Judged = dict[str, float]
-# Legs that are one drive: length and mass within this share, and places along the lines within this distance.
+# Legs of one drive: share for length and mass, distance for places along the lines.
 ALIKE, ALIKE_M, PLACES = 0.05, 10.0, 9
 
 
 def judged_legs(drive: FleetDrive, recorded: Recorded, scene: Scene, cache: Path) -> list[Judged]:
-    """Figures of every leg: shares that the route is off, and whether its interval holds the truth."""
+    """Figures of every leg: relative route errors, and whether the interval holds the truth."""
     known, truth = KnownMap(recorded.rows), true_squares(scene.truth)
     routes = known.routes()
 
@@ -140,7 +140,7 @@ def judged_legs(drive: FleetDrive, recorded: Recorded, scene: Scene, cache: Path
 
 
 def drives_of(legs: Sequence[Leg]) -> list[int]:
-    """Which drive each leg repeats: one line with one load has its errors in common, however often it is driven."""
+    """Drive that each leg repeats: one line with one load has common errors, however often driven."""
     numbers: list[int] = []
     for i, leg in enumerate(legs):
         same = (numbers[k] for k in range(i) if _alike(leg, legs[k]))
@@ -159,7 +159,7 @@ def _alike(a: Leg, b: Leg) -> bool:
 
 
 def _judged(leg: Leg, there: RouteTotals, back: RouteTotals, truth: Squares) -> Judged:
-    """back: nobody drove it; its truth is the same drive over the true map."""
+    """back: never driven; its truth is the drive over the true map."""
     _, true_there = route(leg.line_m, truth, leg.machine, stops=leg.stops)
     _, true_back = route(leg.line_m[::-1], truth, leg.machine, stops=leg.stops)
     steady_j = leg.machine.mass_kg * GRAVITY_MPS2 * (_rolling(leg, truth) + true_there.lift_m)
@@ -179,13 +179,13 @@ def _judged(leg: Leg, there: RouteTotals, back: RouteTotals, truth: Squares) -> 
 
 
 def _rolling(leg: Leg, truth: Squares) -> float:
-    """Resistance times way [m]: what a drive costs that neither starts nor brakes, and rises nowhere."""
+    """Resistance times distance [m]: a drive without starts, stops or climbs."""
     middles = 0.5 * (leg.line_m[1:] + leg.line_m[:-1])
     return float((truth.at(middles)["resistance_filled"] * np.hypot(*np.diff(leg.line_m, axis=0).T)).sum())
 
 
 def seed_figures(legs: Sequence[Judged]) -> dict[str, float]:
-    """Of one recording, in percent: root mean square over its legs, means, the worst leg, and shares inside."""
+    """Percent over one recording's legs: RMS, means, worst leg, shares inside intervals."""
     column = {name: np.array([leg[name] for leg in legs]) for name in legs[0]}
     holds = [column["energy_inside"][column["drive"] == number].mean() for number in np.unique(column["drive"])]
     return {

@@ -1,4 +1,4 @@
-"""Maps to ask for routes: what a server makes of samples, and the truth in the same form."""
+"""Maps to query for routes: a server's from samples, and the truth in the same form."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SITE = SiteConfig("judged", 48.0, 9.0)
 
 
 class KnownMap:
-    """The map that a server would have of samples, with the parts of a source that routes ask."""
+    """A server's map from samples, with the parts of a source that routes need."""
 
     def __init__(self, samples: Mapping[str, Table], site: SiteConfig = SITE) -> None:
         self.site, self.config = site, ServerConfig()
@@ -44,7 +44,7 @@ class KnownMap:
         return self._names
 
     def routes(self) -> Routes:
-        """What answers queries for routes of the map as it is, without roads."""
+        """Route queries on the current map, without roads."""
         layers = BlockLayers(self.site.cell_m, self.config)
 
         def look(squares: Set[tuple[int, int]], names: Sequence[str], as_of_ns: int | None, **_: bool) -> Look:
@@ -56,7 +56,7 @@ class KnownMap:
 
 
 def true_squares(truth: TruthMap) -> Squares:
-    """A true map as a route reads it: known everywhere, without doubt."""
+    """A true map as read by routes: known everywhere, without uncertainty."""
     rows, columns = truth.c_rr.shape
     edge = max(rows, columns)
 

@@ -1,4 +1,4 @@
-"""Figures of small runs, without PyBullet: `python -m lab.tests.stored` stores them anew in stored.json."""
+"""Figures of small runs without PyBullet; `python -m lab.tests.stored` renews stored.json."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report, Row
 
 FILE = Path(__file__).parent / "stored.json"
-COST = ("us_per_second", "seconds")  # what a processor takes is no figure of a method
+COST = ("us_per_second", "seconds")  # CPU time depends on the host
 
 FAST = replace(PAPER, world="fast")
 POSITIONS = tuple(
@@ -38,7 +38,7 @@ RUNS: dict[str, Callable[[Runner], Report]] = {
 
 
 def figures(name: str, cache: Path) -> list[Row]:
-    """The rows of a run."""
+    """Rows of a run, without CPU time."""
     return [{**row, **dict.fromkeys(COST)} for row in plain(RUNS[name](Runner(cache))["rows"])]
 
 

@@ -1,4 +1,4 @@
-"""`python -m lab`: each command declares itself, refuses what is wrong in one line, and passes on its options."""
+"""`python -m lab`: commands declare themselves, refuse errors in one line, pass options on."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from lab import commands
 from sitegrid.command_line import build_parser, run
 from sitegrid.options.values import count, positive, seed
 
-# Where the work of each command begins: module and function; these take seeds.
+# Entry point of each command; these take seeds.
 WORK = {
     "calibration": "lab.calibration.experiment",
     "can": "lab.can.experiment",
@@ -41,7 +41,7 @@ def parsers(parser: ArgumentParser) -> dict[str, ArgumentParser]:
 
 
 def wrong_words() -> list[tuple[str, ...]]:
-    """Each option of each command with a value that it does not have."""
+    """Every option of every command with an invalid value."""
 
     def wrong_word(name: str, option: Action) -> tuple[str, ...] | None:
         wrong = "nonsense" if option.choices and option.option_strings else WRONG.get(option.type)

@@ -1,5 +1,3 @@
-"""Constants that are varied one by one."""
-
 from dataclasses import asdict, fields
 
 import pytest

@@ -1,5 +1,3 @@
-"""Small runs have the figures that are stored, to the digit."""
-
 import json
 from pathlib import Path
 

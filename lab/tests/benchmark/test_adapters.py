@@ -1,4 +1,4 @@
-"""Methods from outside: what they make of samples whose map is known, and files that the benchmark takes."""
+"""External methods: maps of samples with known ground, in the benchmark's format."""
 
 import ast
 import math
@@ -20,7 +20,7 @@ GROUND = np.zeros((30, 40), np.float32)
 
 
 def samples() -> np.ndarray:
-    """Two lanes from west to east: dirt in the west, sand in the east."""
+    """Two eastward lanes: dirt in the west, sand in the east."""
     rows = empty(128)
     along = np.tile(np.arange(64) * 0.5 + 2.0, 2)
     rows["stamp_ns"], rows["x_m"], rows["y_m"] = np.arange(128)[::-1] + 1, along, np.repeat([10.5, 11.5], 64)

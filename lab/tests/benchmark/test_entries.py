@@ -1,4 +1,4 @@
-"""Files that others enter: what is read, and how a wrong line is refused."""
+"""Files of entries: parsing, and refusal of wrong lines."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Scores of maps whose worth is known, and the quick edition from nothing to the table."""
+"""Scores of known maps, and the whole quick edition."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ from sitegrid.process.lifetime import plain
 from sitegrid.proof.map_score import driven_cells
 from tests.arithmetic import ARITHMETIC, arithmetic
 
-pytestmark = pytest.mark.timeout(900)  # agents replay two recordings, maybe on a busy machine
+pytestmark = pytest.mark.timeout(900)  # agents replay two recordings, maybe on a busy host
 PUBLISHED = recordings.published_hashes()
 STORED = Path(__file__).parent / "quick.json"
 
@@ -93,7 +93,7 @@ def made(data: Path) -> list[dict]:
 
 @pytest.mark.slow
 def test_the_quick_edition_has_the_published_hashes_and_the_stored_figures(made, data: Path):
-    """`python -m lab bench score --quick --json` printed the figures; elsewhere samples have other bits."""
+    """Figures from `python -m lab bench score --quick --json`; other arithmetic gives other bits."""
     known = PUBLISHED[recordings.edition_key(QUICK)]
     assert {row["name"] for row in made} == set(known)
     if arithmetic() == ARITHMETIC:
@@ -142,7 +142,7 @@ def test_a_recording_that_was_cut_is_not_scored_on(made, data: Path, part: str):
     try:
         with pytest.raises(ConfigError, match="is not what was made; delete the folder"):
             scores.run(data, QUICK, (), 1)
-        if part != "samples.csv":  # which are written again
+        if part != "samples.csv":  # samples are rewritten
             with pytest.raises(ConfigError, match="truth: is not what was made"):
                 recordings.make(Runner(data), QUICK)
     finally:

@@ -1,4 +1,4 @@
-"""Fleets whose samples, ground and errors are known, for experiments that would take minutes on recordings."""
+"""Fleets with known samples, ground and errors, in place of slow recordings."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ def truth() -> TruthMap:
 
 
 def track(rows: Table) -> LoadTrack:
-    """As if the samples were where the machine was; headings of the drive, slopes of the ground."""
+    """The samples' places as truth; headings of the drive, slopes of the ground."""
     place = np.stack([rows["x_m"], rows["y_m"]], axis=1)
     gradient = np.stack([height_slope(rows["x_m"]), np.zeros(len(rows))], axis=1)
     driven = np.cumsum(rows["distance_m"].astype(np.float64))

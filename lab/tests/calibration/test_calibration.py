@@ -1,4 +1,4 @@
-"""Cases of fleet calibration: what is tampered with, what the truth shows of it, and how rows are made."""
+"""Cases of fleet calibration: tampering, true errors, rows."""
 
 from __future__ import annotations
 

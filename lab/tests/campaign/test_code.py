@@ -1,4 +1,4 @@
-"""The version of code: of a module, of all that it imports of this project, and of data beside them."""
+"""Code version: a module, its imports in this project, and data."""
 
 import ast
 from pathlib import Path
@@ -57,7 +57,7 @@ def test_what_is_only_said_in_another_way_is_the_same(project: Path):
 
 
 def test_nothing_that_results_are_made_of_is_imported_by_a_name_made_at_run_time():
-    """It would not be seen; a library may be."""
+    """They would be missed; libraries may do it."""
     root = Path(__file__).parents[3]
     for package in ("agents", "mapserver", "protocol", "sim"):
         for path in (root / package).rglob("*.py"):

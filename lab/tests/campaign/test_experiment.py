@@ -1,4 +1,4 @@
-"""The runner of experiments: results are kept, an interrupted run goes on, and nothing meets results of other code."""
+"""Runner of experiments: cached results, resumed runs, no mixing of code versions."""
 
 import json
 from dataclasses import dataclass, replace
@@ -13,13 +13,11 @@ from lab.campaign.experiment import Experiment, Runner, Task, read_result, repla
 from lab.campaign.recordings import PlannedDrive
 from protocol.errors import SitegridError
 
-DONE = "done.txt"  # in the cache: names of the tasks that were done, a line each
+DONE = "done.txt"  # in the cache: names of finished tasks, one per line
 
 
 @dataclass(frozen=True)
 class Power:
-    """A variant that takes no time."""
-
     exponent: int
 
     @property

@@ -1,4 +1,4 @@
-"""Figures of experiments: intervals over seeds, and goals."""
+"""Figures of experiments: intervals over seeds, goals."""
 
 import math
 
@@ -18,7 +18,7 @@ def test_interval_of_a_mean_holds_it_19_times_in_20():
 
 @pytest.mark.parametrize("value", [0.4, -0.4, 0.41, -0.41, 0.39, None, math.nan])
 def test_a_goal_is_met_up_to_its_limit_and_never_by_what_is_not_known(value):
-    """A bias counts by its size."""
+    """A bias counts by its absolute value."""
     assert Goal({}, "wrong_pct", "<=", 0.4).is_met(value) is (value in (0.4, -0.4, 0.39))
     assert Goal({}, "wrong_pct", ">=", 0.4).is_met(value) is (value in (0.4, 0.41))
 

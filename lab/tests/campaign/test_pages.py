@@ -87,5 +87,5 @@ def test_a_page_is_written_only_where_it_is_another_one(folder, capsys):
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*.md")), ids=lambda path: path.name)
 def test_pages_have_the_figures_of_their_reports(path):
-    """Where not: `python -m lab.campaign.pages` and the page."""
+    """If not: run `python -m lab.campaign.pages` on the page."""
     assert filled(path.read_text(), path.parent) == path.read_text()

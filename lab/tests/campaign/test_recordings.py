@@ -1,4 +1,4 @@
-"""Recordings of one machine: the route and the sensors that were planned, whole or not there."""
+"""Recordings of one machine: planned route and sensors, complete or missing."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Worker processes: of one thread, without traces in this process, and gone when it ends."""
+"""Worker processes: single-threaded, isolated, gone at the end."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Made-up samples of a machine that drives east, and made-up tracks, for tests of cooperation."""
+"""Synthetic samples of an eastward drive, and tracks."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ SECOND_NS = 10**9
 
 
 def driving(begin_s: float, count: int, y_m: float = 20.5, c_rr: float = 0.02) -> Table:
-    """Samples a second apart, one metre each, from (20.5, y_m) on."""
+    """Samples from (20.5, y_m) on, one per second and metre."""
     rows = np.zeros(count, SAMPLE_DTYPE)
     rows["stamp_ns"] = START_NS + np.round((begin_s + np.arange(count)) * 1e9).astype(np.int64)
     rows["x_m"], rows["y_m"] = 20.5 + np.arange(count), y_m

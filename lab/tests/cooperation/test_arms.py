@@ -1,4 +1,4 @@
-"""Arms: what their links are like, and what is wrong with a spoiled machine."""
+"""Arms: links, and spoiled machines."""
 
 from pathlib import Path
 
@@ -37,7 +37,7 @@ def readings(cache: Path, scratch: Path, spoiled: str) -> tuple:
 def test_a_link_is_lost_a_fifth_of_the_time_by_turns():
     cut = np.array([[LOST.weather(turn, second, 8.0).cut for second in range(3000)] for turn in range(4)])
     assert cut.mean(axis=1).tolist() == [0.2] * 4
-    assert cut.sum(axis=0).max() == 1  # never two machines at once
+    assert cut.sum(axis=0).max() == 1  # at most one machine at a time
     assert np.diff(np.flatnonzero(np.diff(cut[0].astype(int)) == 1)).tolist() == [300] * 9
 
 

@@ -1,4 +1,4 @@
-"""What is driven: tours that one machine drives in turn as several drive them at once."""
+"""Drives: tours in turn by one machine, or at once by several."""
 
 from pathlib import Path
 

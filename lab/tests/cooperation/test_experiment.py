@@ -1,4 +1,4 @@
-"""The report of cooperation: rows of made-up figures, goals, refusals."""
+"""Report of cooperation: rows of synthetic figures, goals, refusals."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ PLAN = Plan.full(SEEDS)
 
 
 def scored(arm, *, share_per_min: float, central: bool = False) -> Scored:
-    """Figures of an arm that covers so much more of the network each minute."""
+    """Figures of an arm with linear coverage."""
     over_time = np.zeros((len(MINUTES), len(FIGURES)))
     over_time[:, 0] = np.minimum(100.0, share_per_min * MINUTES)
     figures = dict.fromkeys(FIGURES, 5.0)

@@ -1,4 +1,4 @@
-"""Maps of an arm as they were: by stamps, by arrival, and with what the server had decided by then."""
+"""Maps of an arm over time: by stamp, by arrival, with the decisions made so far."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def corrects(machine: str, zero: float, second: float) -> CalibrationDecision:
 
 @pytest.fixture
 def run() -> LiveRun:
-    """Two machines on lanes of their own for 20 s; all arrives half a minute late."""
+    """Two machines on separate lanes for 20 s, arriving 30 s late."""
     samples = np.concatenate([driving(0, 20, 10.5), driving(0, 20, 30.5, c_rr=0.06)])
     return LiveRun(
         samples=samples,

@@ -1,4 +1,4 @@
-"""Cells of the road network, and figures of maps with known answers."""
+"""Cells of the road network, and figures of known maps."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,6 @@ def cells() -> Network:
 
 
 def perfect(cells: Network) -> dict:
-    """The map that is right everywhere."""
     layers = {name: np.full((150, 200), np.nan) for name in ("resistance", "grade_east", "grade_north")}
     at = cells.row, cells.column
     layers["resistance"][at], layers["grade_east"][at], layers["grade_north"][at] = cells.c_rr, *cells.plane.T
@@ -66,5 +65,5 @@ def test_distance_from_a_break_of_slope_counts_from_the_ramps_foot():
     distance = break_distance(slope, 1.0)
     assert distance[2, 19] == distance[2, 20] == 0.5
     assert distance[2, 10] == 9.5
-    slope[:, 20:, 0] = 0.002  # no break: less than a step
+    slope[:, 20:, 0] = 0.002  # less than a slope step
     assert np.isinf(break_distance(slope, 1.0)).all()

@@ -1,4 +1,4 @@
-"""Cooperation, its quick version: real agents, router and map server, each a process of its own."""
+"""Quick version of cooperation: real agents, router and map server as processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report
 
 STORED = Path(__file__).parent / "quick.json"
-# By the time that a decision is made, which differs from run to run; points of percent.
+# Tolerances in points: the time of decisions varies between runs.
 WITHIN = {"covered_pct": 15.0, "wrong_pct": 15.0, "c_rr_pct": 15.0, "driven_wrong_pct": 15.0, "grade_pct": 0.2}
 EXACT = ("arm", "machines", "link", "recorded_s", "known_pct", "driven_known_pct")
 
@@ -54,14 +54,14 @@ def test_the_server_has_what_one_process_makes_of_the_same_readings_bit_for_bit(
 
 
 def test_its_figures_are_near_those_that_are_stored(result):
-    """`python -m lab cooperation --quick --json` printed them."""
+    """From `python -m lab cooperation --quick --json`."""
     stored, ours = rows(json.loads(STORED.read_text())), rows(result[0])
     assert list(ours) == list(stored) == ["two", "central"]
     for name, row in ours.items():
         assert {key: row[key] for key in EXACT} == {key: stored[name][key] for key in EXACT}
         for key, off in WITHIN.items():
             assert row[key] == pytest.approx(stored[name][key], abs=off), (name, key)
-    # No process races with another in one process: to the digits that are printed.
+    # One process has no races: equal to the printed digits.
     assert {**ours["central"], "same_pct": None} == {**stored["central"], "same_pct": None}
 
 

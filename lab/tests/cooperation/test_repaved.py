@@ -1,4 +1,4 @@
-"""Repaved ground with known answers: passes over it, what was driven, when it is shown."""
+"""Repaved ground with known answers: passes, driven share, detection."""
 
 from dataclasses import replace
 
@@ -28,11 +28,11 @@ def test_a_pass_counts_that_began_after_the_change_and_is_over():
 
 
 def test_repaved_ground_is_shown_once_enough_of_its_cells_have_the_new_class():
-    """One machine goes over the west's ground every 100 s; it measures the change, after 200 s, in its second pass."""
-    line_m = np.roll(lines()["west"].points, 100, axis=0)  # it begins on this ground
+    """A machine crosses the west's ground every 100 s and measures the change, at 200 s, in its second pass."""
+    line_m = np.roll(lines()["west"].points, 100, axis=0)  # starts on this ground
     there_m = line_m[inside(REPAVED["west"], line_m, 1.0)]
     n = len(there_m)
-    lap_m = np.concatenate([there_m, np.full((200 - n, 2), 5.0)])  # half a second from point to point
+    lap_m = np.concatenate([there_m, np.full((200 - n, 2), 5.0)])  # half a second between points
     own = track(np.concatenate([lap_m] * 5))
     terrain = true_ground(DRIVE.ground, 3).terrain
     for change in DRIVE.changes.values():
@@ -43,7 +43,7 @@ def test_repaved_ground_is_shown_once_enough_of_its_cells_have_the_new_class():
         rows = driving(0, n, c_rr=c_rr)
         rows["stamp_ns"] = own.stamp_ns[200 * number : 200 * number + n]
         rows["x_m"], rows["y_m"] = there_m.T
-        parts.append(np.repeat(rows, 1 if c_rr == 0.008 else 8))  # the newer ones weigh most
+        parts.append(np.repeat(rows, 1 if c_rr == 0.008 else 8))  # newer ones dominate
     samples = np.concatenate(parts)
     known = Timeline(samples, np.zeros(len(samples), int), ("loader-1",), samples["stamp_ns"], ((0, NO_FACTS),))
     late = replace(known, time_ns=known.time_ns + 60 * 10**9)
@@ -51,7 +51,7 @@ def test_repaved_ground_is_shown_once_enough_of_its_cells_have_the_new_class():
     assert (west["ground"], west["passes"]) == ("west", 2)
     assert west["by_pass_pct"][0] == 0.0
     assert west["by_pass_pct"][1] > 95.0
-    assert west["least_passes"] == 1  # its line goes over all of these cells
+    assert west["least_passes"] == 1  # its line covers these cells
     assert west["driven_by_pass_pct"][0] > 95.0
     left_s = (inside(REPAVED["west"], there_m).sum() - 1) / 2  # of its line
     assert west["minutes"] * 60 == pytest.approx(100.0 + left_s, abs=1.0)

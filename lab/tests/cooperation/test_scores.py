@@ -1,4 +1,4 @@
-"""Figures of arms with known answers: times until, rounds, false alarms."""
+"""Figures of arms with known answers: times, rounds, false alarms."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Filtered again from its nodes a drive is what the filter made of it; a map of another day is of use."""
+"""A rerun without lanes reproduces the filter; another day's map helps."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def test_a_drive_filtered_again_is_the_same(nodes):
     again = rerun(nodes, lambda _: None, aids=False)
     assert np.abs(again.live_m + nodes.true_m - nodes.x[:, :2]).max() < 1e-6
     assert np.abs(again.live_m2 - nodes.P[:, :2, :2]).max() < 1e-6
-    known_ns = nodes.stamp_ns[:-91]  # of the others the smoother knows the end of the drive, after the last node
+    known_ns = nodes.stamp_ns[:-91]  # for later nodes the smoother already knows the end of the drive
     _, at, of_rows = np.intersect1d(known_ns, nodes.rows["stamp_ns"], return_indices=True)
     rows, heading = nodes.rows[of_rows], nodes.rows["heading_rad"][of_rows].astype(float)
     places = again.smoothed_m[at] + nodes.true_m[at] + nodes.ahead_m * np.stack([np.cos(heading), np.sin(heading)], 1)

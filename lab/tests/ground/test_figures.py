@@ -1,4 +1,4 @@
-"""Figures of samples made by hand, on ground whose borders, steps and slopes are known exactly."""
+"""Figures of synthetic samples on ground with known borders, steps and slopes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +27,7 @@ def ground(*zones: ZoneConfig, ramp: tuple[RampConfig, ...] = (), roughness_m: f
 
 
 def drive_east() -> LoadTrack:
-    """From x = 0 at constant speed, 10 rows a second."""
+    """From x = 0 at constant speed, 10 rows per second."""
     x = np.arange(0.0, 40.0 + 1e-9, SPEED_MPS / 10)
     stamps = START_NS + np.round(x / SPEED_MPS * 1e9).astype(np.int64)
     place_m = np.stack([x, np.full(len(x), 10.5)], axis=-1)
@@ -35,7 +35,7 @@ def drive_east() -> LoadTrack:
 
 
 def samples_of(track: LoadTrack, c_rr=0.04, every_m: float = EVERY_M, **columns) -> np.ndarray:
-    """A sample each half metre, in the middle of its stretch."""
+    """A sample every half metre, centred in its interval."""
     x = np.arange(every_m / 2, track.driven_m[-1], every_m)
     rows = np.zeros(len(x), SAMPLE_DTYPE)
     rows["stamp_ns"] = START_NS + np.round(x / SPEED_MPS * 1e9).astype(np.int64)
@@ -68,13 +68,13 @@ def test_a_right_estimate_has_right_figures():
 
 
 def test_an_estimate_that_comes_late_is_wrong_right_behind_the_border():
-    """Placed 3 m too far: six samples and three cells of forty; one of them is more than 2 m inside."""
+    """3 m late: six samples and three of forty cells; one of them more than 2 m inside."""
     judged = compared(steps_at(BORDER_M + 3.0))
     row = figures(judged)
     assert row["right_class_pct"] == pytest.approx(100 * 74 / 80)
     assert row["wrong_cells_pct"] == pytest.approx(100 * 3 / 40)
     assert row["wrong_cells_interior_pct"] == pytest.approx(100 * 1 / 36)
-    assert row["place_off_m"] == pytest.approx(3.25, abs=0.03)  # of the first sample behind, in its stretch's middle
+    assert row["place_off_m"] == pytest.approx(3.25, abs=0.03)  # of the first sample beyond, centred in its interval
     assert row["lag_m"] == pytest.approx(3.25 + LAG_S * SPEED_MPS, abs=0.03)
     assert row["lag_s"] == pytest.approx((3.25 + LAG_S * SPEED_MPS) / SPEED_MPS, abs=0.02)
     wet = next(soil for soil in soils(judged.cells) if soil["name"] == "wet dirt")
@@ -91,7 +91,7 @@ def test_a_change_that_is_never_noticed_has_no_lag_and_one_that_is_noticed_befor
 
 
 def test_cells_take_the_mean_over_the_distance_that_samples_stand_for():
-    """1 m at 0.03 and 3 m at 0.06 are 0.0525: wet dirt, where plain means would say dry."""
+    """1 m at 0.03 and 3 m at 0.06 give 0.0525: wet dirt; the plain mean would be dry."""
     rows = samples_of(EAST)[:2]
     rows["c_rr"], rows["distance_m"] = (0.03, 0.06), (1.0, 3.0)
     cells = cell_means(place(rows, EAST, HERE), HERE)
@@ -99,7 +99,7 @@ def test_cells_take_the_mean_over_the_distance_that_samples_stand_for():
 
 
 def test_gradients_are_compared_along_the_true_heading():
-    """Facing north, 1 degree too steep ahead and 2 degrees to the left, which is west."""
+    """Facing north, 1 degree too steep ahead, 2 degrees to the left (west)."""
     track = replace(EAST, yaw_rad=np.full(201, np.pi / 2))
     one, two = np.tan(np.radians([1.0, 2.0]))
     row = figures(compared(here=ground(), track=track, grade_n=one, grade_e=-two))
@@ -109,7 +109,7 @@ def test_gradients_are_compared_along_the_true_heading():
 
 
 def test_slopes_have_cells_and_edges_of_their_own():
-    """15 degrees from x = 20 to 30; foot and crown are rounded over 2 m, and excluded 2 m around."""
+    """15 degrees from x = 20 to 30; foot and crown are rounded over 2 m, and excluded with 2 m around."""
     rise = 10 * np.tan(np.radians(15))
     ramped = ground(ramp=(RampConfig((20.0, 0.0), (30.0, 0.0), rise),))
     track = replace(EAST, gradient=ramped.slope(EAST.place_m))
@@ -136,7 +136,7 @@ def test_a_track_is_read_as_that_of_the_load_centre(tmp_path: Path):
     )
     track = read_load_track(tmp_path / "a.csv", 2.0)
     middle = track.at(np.array([START_NS + 5 * 10**7, START_NS - 1]))
-    assert np.cos(middle.yaw_rad[0]) == pytest.approx(-1.0)  # through pi, not through 0
+    assert np.cos(middle.yaw_rad[0]) == pytest.approx(-1.0)  # through pi, not 0
     np.testing.assert_allclose(middle.place_m[0], [0.5 + 2 * np.cos(3.1), 0.0], atol=1e-9)
     np.testing.assert_allclose(middle.gradient[0], [0.1, 0.3])
     assert np.isnan(middle.driven_m[1])

@@ -1,4 +1,4 @@
-"""The cases on which merges are compared are what they say."""
+"""Cases for map merging are as described."""
 
 from dataclasses import replace
 

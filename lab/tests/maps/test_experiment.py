@@ -1,4 +1,4 @@
-"""The comparison of merges: figures of maps that are right or wrong where they are meant to be, and rows."""
+"""Comparison of merges: figures of maps with known errors, and rows."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def small(kind: str) -> MapCase:
 
 
 def scene_of(kind: str) -> tuple[MapCase, MapScene]:
-    """A small case whose every cell was driven."""
+    """A small, completely driven case."""
     site = build_site(small(kind))
     return small(kind), MapScene((), site, None, np.ones(site.c_rr.shape, bool))
 
@@ -49,7 +49,7 @@ def test_cells_beside_a_parked_machine_are_judged_apart():
     case, scene = scene_of("parked_bad_machine")
     near = near_parked(case)
     assert near.sum() == pytest.approx(np.pi * NEAR_M**2, rel=0.1)
-    assert near[7, 36]  # three metres east of where it truly stands, at (33.75, 7.5)
+    assert near[7, 36]  # 3 m east of its true place (33.75, 7.5)
     assert not near[7, 32]
     estimated = np.where(near, 0.06, scene.site.c_rr)
     assert figures(case, scene, {"resistance": estimated})["near_wrong_pct"] == 100.0

@@ -1,4 +1,4 @@
-"""Merges on samples whose map is known."""
+"""Merges of samples with a known map."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def samples(stamp, x, y, c_rr):
     [
         (last_write, [0, 2, 0], [1, 5, 3]),
         (mean, [0, 2, 0], [2, 5, 4]),
-        (median, [0, 0, 0, 2, 2, 0, 0], [1, 2, 90, 4, 6, 3, 80]),  # stands outliers
+        (median, [0, 0, 0, 2, 2, 0, 0], [1, 2, 90, 4, 6, 3, 80]),  # robust to outliers
     ],
 )
 def test_a_cell_has_the_last_value_or_the_mean_or_the_median(method, cell, value):
@@ -61,7 +61,7 @@ def test_samples_fall_into_the_cell_of_their_stated_position():
 
 
 def deliveries():
-    """Two machines on the same ten cells across a block's edge, which agree."""
+    """Two consistent machines on the same ten cells across a block edge."""
     stamp = np.arange(1, 51) * 10**9
     x, y = np.tile(np.arange(11, 21) - 0.5, 5), np.full(50, 16.5)
     return [Delivery(name, samples(stamp, x, y, 0.02), int(stamp[-1])) for name in ("a", "b")]

@@ -1,4 +1,4 @@
-"""Forecasts of classes and stated deviations: their scores on cells whose answer is known."""
+"""Scores of class forecasts and stated deviations with known answers."""
 
 import math
 
@@ -29,7 +29,7 @@ def test_who_is_right_as_often_as_said_has_no_error():
 def test_scores_of_a_single_cell():
     sure, wrong = Believed(np.array([0.8]), np.array([True])), Believed(np.array([1.0]), np.array([False]))
     assert (sure.brier, sure.log_score) == (pytest.approx(0.04), pytest.approx(-math.log(0.8)))
-    assert (wrong.brier, wrong.log_score) == (1.0, pytest.approx(-math.log(0.001)))  # not infinite
+    assert (wrong.brier, wrong.log_score) == (1.0, pytest.approx(-math.log(0.001)))  # finite
     both = pooled([sure, wrong])
     assert both.brier == pytest.approx(0.52)
     assert both.calibration_error == pytest.approx((0.2 + 1.0) / 2)

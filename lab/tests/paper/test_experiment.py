@@ -1,4 +1,4 @@
-"""The paper's report: rows of made-up figures, and the quick version, whose figures are stored."""
+"""The paper's report: rows of synthetic figures, and the quick version with stored figures."""
 
 import json
 from dataclasses import replace
@@ -17,7 +17,7 @@ from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report
 
 STORED = Path(__file__).parent / "quick.json"
-NO_STORE = {"us_per_second": None}  # what a processor takes is no figure of the method
+NO_STORE = {"us_per_second": None}  # CPU time depends on the host
 
 
 def figures(wrong_pct: float) -> dict:
@@ -70,7 +70,7 @@ def result(runner: Runner) -> tuple[Report, Outcomes]:
 
 @pytest.mark.slow
 def test_the_quick_version_has_the_figures_that_are_stored(result):
-    """`python -m lab paper --quick --json` printed them."""
+    """From `python -m lab paper --quick --json`."""
     report = plain(result[0])
     stored = json.loads(STORED.read_text())
     assert [{**row, **NO_STORE} for row in report["rows"]] == [{**row, **NO_STORE} for row in stored["rows"]]

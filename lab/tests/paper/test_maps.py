@@ -1,4 +1,4 @@
-"""Maps of samples whose ground and errors are known: who has which places and values, and what is taken off."""
+"""Maps with known ground and errors: positions, values, corrections."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from lab.tests.calibration.scenes import made_scene
 from protocol.arrays import Table
 from sitegrid.proof.map_score import score
 
-EAST_M, NORTH_M = 6.0, -2.0  # that the places which are known at once are off
+EAST_M, NORTH_M = 6.0, -2.0  # offset of real-time positions
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def scene() -> tuple[dict[str, Table], Scene]:
 
 @pytest.fixture(scope="module")
 def made(scene) -> MadeMaps:
-    """Of samples that lay elsewhere at first, and are where machines were at last."""
+    """Maps of samples with wrong real-time positions and right smoothed ones."""
     rows, true = scene
     live = {name: table.copy() for name, table in rows.items()}
     for table in live.values():

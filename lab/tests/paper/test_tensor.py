@@ -1,4 +1,4 @@
-"""The paper's tensor: places and values where they belong."""
+"""The paper's tensor: places and values."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def test_a_cell_is_its_place_and_its_value():
     assert made.shape == (2, COLUMNS, ROWS, 3)
     np.testing.assert_allclose(made[0, 2, 0], [12.5, 20.5, 0.06])
     np.testing.assert_allclose(made[0, 1, 1], [11.5, 21.5, 0.25])
-    np.testing.assert_allclose(made[1, 0, 0], [10.5, 20.5, 0.5])  # steepness, whichever way is up
+    np.testing.assert_allclose(made[1, 0, 0], [10.5, 20.5, 0.5])  # steepness, unsigned
     np.testing.assert_allclose(made[1, 2, 1], [12.5, 21.5, 0.2])
 
 

@@ -1,4 +1,4 @@
-"""The paper's table: its rows, its figures, and how a row becomes a machine and options."""
+"""The paper's table: rows, figures, conversion to machine and options."""
 
 from lab.campaign.recordings import PlannedDrive
 from lab.positions import configurations as table

@@ -1,4 +1,4 @@
-"""The table: its rows on made-up scores, and on short recordings."""
+"""The table: rows from synthetic scores, and from short recordings."""
 
 import math
 from dataclasses import replace
@@ -46,7 +46,7 @@ def test_ratios_are_of_profiles_and_of_filters_that_were_both_run():
 
 
 def test_one_more_receiver_is_compared_on_the_same_fixes():
-    """Of shares, each with its own: receivers that share all they err are worth no more than one."""
+    """Per share: receivers that share all errors are worth one."""
     nets = {ONE: 2.0, TWO: 1.5, replace(ONE, machine_share=0.95): 2.0, SHARED: 1.9}
     pairs = ratios({row: [score(net), score(2 * net)] for row, net in nets.items()})
     assert [(r["ratio"], r["gps"], r["machine_share"], r["net"]) for r in pairs] == [
@@ -67,7 +67,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_the_share_that_was_recorded_is_the_recording_itself(cache: Path):
-    """And another one changes what all receivers read, but not when: the drive and the seed are the same."""
+    """Another share changes all fixes, but not their times, drive or seed."""
     recording = load(DRIVE.folder(cache))
     assert experiment._with_share(experiment.replay_task(TWO, DRIVE), cache) == recording
     shared = experiment._with_share(experiment.replay_task(SHARED, DRIVE), cache)

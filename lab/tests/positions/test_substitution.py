@@ -1,4 +1,4 @@
-"""Fixes made anew from the truth, with the errors that are asked for."""
+"""Replaced fixes from the truth with given errors."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from sim.simulator import START_NS
 
 DRIVE = PlannedDrive(3, 15.0, setup=replace(PAPER, world="fast"))
 NOISE = load_preset("paper").gps
-QUICK = replace(NOISE, drift_time_s=0.2)  # of which readings 0.2 s apart correlate by 1/e: half of them count
+QUICK = replace(NOISE, drift_time_s=0.2)  # readings 0.2 s apart correlate by 1/e: half of them count
 LONG_NS = START_NS + 500_000_000_000
 FIXES = 5 * 500
 

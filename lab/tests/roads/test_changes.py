@@ -1,4 +1,4 @@
-"""Detection of changed ground on tracks and roads whose result is known."""
+"""Change detection on tracks and roads with known results."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ LINE = along([(10, 20), (250, 20)])
 WINDOW = CellWindow(0, 0, 260, 40)
 OLD, NEW = 0.06, 0.02
 REPAIRED_M = 100.0, 160.0  # along x
-HALF_S = 600.0  # a pass of the line takes 48 s, and the next one begins 20 s later
+HALF_S = 600.0  # a pass takes 48 s, the next starts 20 s later
 
 
 def changed_ground() -> ChangedGround:
@@ -25,7 +25,7 @@ def changed_ground() -> ChangedGround:
 
 
 def drive(later: int, *, repaired: bool = True) -> Recorded:
-    """Two machines, each with eight passes before half time, and so many after it."""
+    """Two machines with eight passes before half time, `later` after."""
     rows, tracks = {}, {}
     for i, name in enumerate("ab"):
         halves = ((8, 0.0), (later, HALF_S))
@@ -49,7 +49,7 @@ def judged(recorded: Recorded) -> tuple[SegmentRepairs, dict[str, Changes]]:
 
 @pytest.mark.slow
 def test_a_repaired_stretch_has_the_figures_that_are_stored():
-    """A segment has the cells of its line, also those before and behind the stretch: figures of `cells, repairs`."""
+    """A segment's cells include those beyond the repaired stretch, hence the figures of `cells, repairs`."""
     _, each = judged(drive(7))
     rows = {kind: rounded(pooled([part]), 1) for kind, part in each.items()}
     kept = ("changed", "said", "precision_pct", "recall_1_pct", "by_2_pct", "delay_passes", "false_alarms")
@@ -72,7 +72,7 @@ def test_a_change_that_nothing_shows_is_found_nowhere():
 
 
 def track(*points: tuple[float, float, float]) -> TrueTrack:
-    """A machine that is at places x, y after seconds, with a straight line between."""
+    """A machine at x, y after seconds, straight in between."""
     second, x, y = np.array(points).T
     step = np.hypot(np.diff(x, prepend=x[0]), np.diff(y, prepend=y[0]))
     none = np.zeros(len(x))
@@ -118,8 +118,8 @@ def test_a_change_needs_the_passes_until_the_one_that_showed_it():
     def needed(machines, seen):
         return TrueRepair(0, stamps, shown_at(later, machines, seen)).needed
 
-    assert needed(["b"], 11) == 2  # and not what drove in the rest of that minute
-    assert needed(["b"], 19) == 3  # it began in that minute, and ended later
+    assert needed(["b"], 11) == 2  # without later drives in that minute
+    assert needed(["b"], 19) == 3  # started in that minute, ended later
     assert needed(["a"], 40) == 4
-    assert needed(["c"], 11) == 2  # it was over half of the segment in no true pass
+    assert needed(["c"], 11) == 2  # never over half of the segment
     assert needed([], None) is None

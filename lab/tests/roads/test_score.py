@@ -1,4 +1,4 @@
-"""Figures of roads on data whose result is known, and recordings that can be loaded."""
+"""Figures of roads with known results, and loadable recordings."""
 
 import numpy as np
 import pytest
@@ -52,11 +52,11 @@ def test_names_are_those_of_the_day_before_where_the_same_roads_are_driven():
     whole = roads(first.rows)
     assert kept_after(first, recorded(line, 2), whole) > 95
     assert kept_after(first, recorded(elsewhere, 2), whole) == 100.0
-    assert first.rows["a"]["stamp_ns"].max() < 1_770_000_000 * 10**9  # nothing was moved in place
+    assert first.rows["a"]["stamp_ns"].max() < 1_770_000_000 * 10**9  # nothing was modified in place
 
 
 def test_a_day_after_is_judged_with_the_next_seed_and_what_is_judged_is_kept(tmp_path, monkeypatch):
-    """Which tasks there are; recordings and agents are not made here."""
+    """Tasks only, without recordings and agents."""
     asked = []
 
     class Runner:

@@ -1,4 +1,4 @@
-"""Figures of routes on data whose result is known; maps of ways that are drawn from a seed."""
+"""Figures of routes with known results; drawn maps for ways."""
 
 import numpy as np
 import pytest

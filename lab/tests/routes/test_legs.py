@@ -1,4 +1,4 @@
-"""Legs of tracks that are made up: from stop to stop, once around, and what is none."""
+"""Legs of synthetic tracks: stop to stop, laps, and none."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ HZ = 10
 
 
 def track(speed, heading):
-    """Of a machine that is driven so, at 10 Hz."""
+    """Track at 10 Hz."""
     step = np.asarray(speed) / HZ
     place = np.cumsum(step[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
     stamps = np.arange(len(step)) * 10**8

@@ -1,4 +1,4 @@
-"""The loads of `python -m lab speed`: one law over all of them, and what they measure with."""
+"""The loads of `python -m lab speed`: one law for all, and their tools."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from protocol.wire.messages import Ack, Refused
 from tests.paths import ROOT
 from tests.site_work import batches, samples_of, seconds_of, write_store
 
-# The smallest size of each load, and cases that it must have.
+# Smallest options of each load, and required cases.
 SMALLEST = {
     "merge": ("--samples 1000 --runs 1", [f"track, {name}" for name in merge.variants()]),
     "ingest": ("--samples 250 --runs 1", ["SQLite, 6 in a batch, 1 in a commit", "SQLite", "PostgreSQL"]),
@@ -44,7 +44,7 @@ COLUMNS = ["case", "figure", "value", "goal", "met"]
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What no option makes small."""
+    """Shrink what has no option."""
     monkeypatch.setattr(sim, "FLEETS", (("paper_site", "pybullet", 1, 1.0), ("busy_site", "fast", 3, 1.0)))
     monkeypatch.setattr(filters, "SMOOTHER_S", 20)
     monkeypatch.setattr(filters, "AGENT_S", 20)
@@ -55,7 +55,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.processes
-@pytest.mark.timeout(1800)  # a drive is simulated, servers settle: on a busy machine that takes its time
+@pytest.mark.timeout(1800)  # simulated drives, settling servers, busy hosts
 @pytest.mark.parametrize("name", LOADS)
 def test_every_load_prints_figures_in_the_same_columns(name, small, capsys):
     words, cases = SMALLEST[name]
@@ -70,7 +70,7 @@ def test_every_load_prints_figures_in_the_same_columns(name, small, capsys):
     assert all(math.isfinite(value) for value in values)
     assert sum(value > 0 for value in values) > len(values) / 2
     judgements = {(row["case"], row["figure"]): row["goal"] for row in rows if row["goal"]}
-    if name not in ("ingest", "sim"):  # PostgreSQL may be missing; fleets are others here
+    if name not in ("ingest", "sim"):  # PostgreSQL may be missing; fleets differ here
         assert judgements == dict(load_of(name).GOALS)
 
 
@@ -104,7 +104,7 @@ def test_variants_take_turns_and_medians_count():
 @pytest.mark.parametrize("draw", [track, scattered])
 def test_both_plain_sums_are_those_of_bincount(draw):
     rows = draw(3000)
-    rows["x_m"][1::2], rows["y_m"][1::2] = rows["x_m"][::2], rows["y_m"][::2]  # cells that are hit again
+    rows["x_m"][1::2], rows["y_m"][1::2] = rows["x_m"][::2], rows["y_m"][::2]  # repeated cells
     cell = np.floor(rows["y_m"]).astype(int) * merge.SIDE + np.floor(rows["x_m"]).astype(int)
     value = rows["c_rr"].astype(float)
     expected = [np.bincount(cell, weights, merge.SIDE**2) for weights in (None, value, value * value)]
@@ -144,7 +144,7 @@ def test_no_place_is_asked_for_twice_and_all_are_where_somebody_drove():
 
 
 class Link:
-    """Stands for a session: takes batches as a server does, but refuses some and answers at once."""
+    """A session that takes batches like a server, refuses some and replies at once."""
 
     def __init__(self) -> None:
         self.taken: Counter[str] = Counter()
