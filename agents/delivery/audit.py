@@ -1,11 +1,10 @@
-"""The audit file: what an agent recorded, line by line at recording time, to compare with the server's journal.
+"""The audit file: what an agent recorded, line by line, to compare with the server's journal.
 
-`+ <spool_id> <seq> <hash>` is a recorded sample (a later line for the same sample replaces it: its final value),
-`- <spool_id> <seq>` one whose identity is void because it was numbered anew. A line is written after its sample is
-committed; lines that a crash prevented are added when the spool is opened again. So no line claims a sample that was
-never on disk, and a disk that loses committed samples shows as a loss. `? <spool_id> <seq> <hash>` is what the disk had
-then of a noted sample, where that is something else: a damaged disk may go back to the value before the final one,
-which may have been delivered already. Either counts.
+`+ <spool_id> <seq> <hash>`: a recorded sample; a later line replaces it (its final value). `- <spool_id> <seq>`: an
+identity made void by renumbering. `? <spool_id> <seq> <hash>`: what the disk held at opening, if not the noted value. A
+damaged disk may return to the value before the final one, which may be delivered already, so either hash counts. Lines
+follow the commit; opening the spool adds those that a crash prevented. So every line was on disk once, and lost commits
+show as a loss.
 """
 
 from collections.abc import Iterable
@@ -15,7 +14,7 @@ from protocol.arrays import Table
 from protocol.machine.samples import content_hash
 
 Identity = tuple[int, int]  # spool_id, seq
-Contents = tuple[str, ...]  # hashes of which each counts: one but after a damage
+Contents = tuple[str, ...]  # valid hashes of a sample: one, unless a disk was damaged
 
 
 class AuditLog:
@@ -31,15 +30,12 @@ class AuditLog:
         self._write(f"+ {spool_id:016x} {first_seq + i} {content_hash(row)}" for i, row in enumerate(rows))
 
     def renumbered(self, old_id: int, old_seqs: Iterable[int], new_id: int, rows: Table) -> None:
-        """Note that samples have a new identity: 1, 2, 3... of spool `new_id`."""
+        """Note new identities of samples: 1, 2, 3... of spool `new_id`."""
         self._write(f"- {old_id:016x} {seq}" for seq in old_seqs)
         self.recorded(new_id, 1, rows)
 
     def complete(self, spooled: Iterable[tuple[int, int, Table]]) -> None:
-        """Add lines that a crash prevented, and end a line that it cut off.
-
-        spooled: the samples that are on disk, as (spool_id, seq, row).
-        """
+        """Add lines that a crash prevented or cut off. spooled: samples on disk, as (spool_id, seq, row)."""
         text = self._path.read_text(encoding="ascii")
         if text and not text.endswith("\n"):
             self._write([" # cut off"])
@@ -60,12 +56,12 @@ class AuditLog:
 
 
 def read_audit(path: Path) -> dict[Identity, Contents]:
-    """What every sample that an agent recorded may be, by identity."""
+    """Valid hashes by identity."""
     return parse(_whole_lines(path.read_text(encoding="ascii")))
 
 
 def parse(lines: Iterable[str]) -> dict[Identity, Contents]:
-    """Hashes by identity, of audit lines; malformed lines are skipped."""
+    """Hashes by identity; malformed lines are skipped."""
     recorded: dict[Identity, Contents] = {}
     for line in lines:
         match line.split() if "#" not in line else []:
@@ -80,5 +76,4 @@ def parse(lines: Iterable[str]) -> dict[Identity, Contents]:
 
 
 def _whole_lines(text: str) -> list[str]:
-    """Lines without a last one that a crash cut off."""
     return text[: text.rfind("\n") + 1].splitlines()

@@ -1,14 +1,12 @@
 """The spool: samples on the machine's own disk until the server has acknowledged them (SQLite, WAL, FULL).
 
-Samples are numbered through in the file. What is recorded between one opening and the next is a **run**, with a random
-`spool_id` of its own; `seq` counts 1, 2, 3... within a run, so that seq = number - base. A file that was copied,
-cloned, restored from a backup or set back by a disk that lies about its syncs therefore never gives one identity to two
-samples: what copies have in common has the same identity and the same bytes (but for positions that were pending), what
-they record from then on has another spool_id.
+Samples are numbered through the file. All that is recorded between two openings is a **run** with a random `spool_id`;
+`seq` counts 1, 2, 3... within it, so seq = number - base. A file that was copied, cloned, restored or set back by a
+lying disk thus never gives one identity to two samples: samples that copies share have the same identity and bytes
+(except pending positions), and later ones have another spool_id.
 
-The newest samples may be **pending**: they have the filter's position, and wait for the smoother's. They are on disk,
-and not sent. Only memory knows that they are pending: whoever opens the file again takes them as they are, since a
-coarse place is better than none.
+The newest samples may be **pending**: on disk with the filter's position, but not sent before the smoother's arrives.
+Only memory knows which ones. After a restart they count as final: a coarse position is better than none.
 """
 
 import contextlib
@@ -38,15 +36,12 @@ from protocol.disk.high_water_mark import HighWaterMark, Traces, look_beside, ma
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, empty
 
-KEPT_RUNS = 16  # earlier runs that are declared again: so a server that was restored from a backup learns what it lost
+KEPT_RUNS = 16  # earlier runs declared again, so that a server restored from a backup learns what it lost
 
 
 @dataclass(frozen=True)
 class SpoolConfig:
-    """max_samples: beyond so many the oldest are dropped, counted, and declared lost to the server.
-
-    Pending ones, which are never more than the smoother's lag holds, do not count.
-    """
+    """max_samples: capacity, without pending samples; beyond it the oldest are dropped and declared lost."""
 
     max_samples: int = 2_000_000
 
@@ -57,10 +52,10 @@ class SpoolConfig:
 
 @dataclass(frozen=True)
 class SpoolRun:
-    """What one opening recorded. base: number of the last sample before it; acknowledged: a seq.
+    """What one opening recorded. base: number of the last sample before it. acknowledged: a seq.
 
-    closed: the server has once accounted for all of it. store: id of the store that it is bound to: that which has
-    acknowledged samples of it, empty before one has.
+    closed: the server has accounted for the whole run. store: id of the store that acknowledged samples of it, or
+    empty.
     """
 
     base: int
@@ -72,7 +67,7 @@ class SpoolRun:
 
 @dataclass(frozen=True)
 class _Meta:
-    """Counts of the file: the last number given out, samples dropped, samples recorded, samples gone with its disk."""
+    """Counts of the file: last number given out, samples dropped, recorded, and lost with the disk."""
 
     newest: int
     dropped: int
@@ -84,15 +79,15 @@ _SampleRow = tuple[int, bytes, int]  # number, sample, checksum
 
 
 def random_id() -> int:
-    """A run's identity: 64 random bits, never zero."""
+    """64 random bits, never zero."""
     return secrets.randbits(64) or 1
 
 
 class Spool:
-    """One machine's samples that are not yet acknowledged. All methods may be called from any thread.
+    """One machine's unacknowledged samples; thread-safe.
 
-    StoreError if the file is damaged, if another process has it open, or if the disk is full or fails. damage: what
-    the file had lost when it was opened, one line; empty for nothing.
+    StoreError: the file is damaged or in use, or the disk is full or fails. damage: what the file had lost when opened,
+    in one line, or empty.
     """
 
     def __init__(
@@ -120,22 +115,22 @@ class Spool:
 
     @property
     def spool_id(self) -> int:
-        """Identity of the run that is being recorded."""
+        """Id of the current run."""
         return self._runs[-1].spool_id
 
     @property
     def newest(self) -> int:
-        """The last sequence number given out in this run."""
+        """Last seq of the current run."""
         return self._end(len(self._runs) - 1)
 
     @property
     def acknowledged(self) -> int:
-        """The last sample of this run that the server has confirmed."""
+        """Last acknowledged seq of the current run."""
         return self._runs[-1].acknowledged
 
     def counters(self) -> dict[str, int]:
-        """Depth, how many of these are pending, and what never reached the server."""
-        with self._lock:  # kept, not counted: that would take long in a full spool
+        """Depth, pending samples, and those that never reached the server."""
+        with self._lock:  # counted on the way: a query would be slow on a full spool
             meta = self._meta
             return {
                 "depth": self._depth,
@@ -147,15 +142,15 @@ class Spool:
             }
 
     def is_settled(self) -> bool:
-        """Whether nothing is left to be sent, and the server has accounted for all earlier runs."""
+        """Whether nothing is left to send and the server has accounted for all earlier runs."""
         with self._lock:
             return self._depth == 0 and self._sending == len(self._runs) - 1
 
     def record(self, rows: Table, *, pending: int = 0, finals: Table | None = None) -> int:
-        """Write samples durably, all together; returns the sequence number of the first new one.
+        """Write samples in one durable transaction; returns the seq of the first new one.
 
-        rows: new ones, of which the last `pending` wait for their final values. finals: those of the samples that have
-        been pending longest, in their order. ValueError if a sample would be final before an earlier one.
+        rows: new samples, the last `pending` of them not final. finals: final values of those pending longest, in
+        order. ValueError if a sample would become final before an earlier one.
         """
         finals = empty() if finals is None else finals
         left = self._pending - len(finals)
@@ -164,16 +159,16 @@ class Spool:
             raise ValueError(f"{len(finals)} final values for {self._pending} pending samples and {new}")
         with self._access():
             base, first, oldest = self._runs[-1].base, self.newest + 1, self.newest - self._pending + 1
-            gone = max(0, self.acknowledged + 1 - oldest)  # a copy of the file has delivered these as they were
+            gone = max(0, self.acknowledged + 1 - oldest)  # already delivered as pending by a copy of the file
             self._write(rows, finals[gone:], base + oldest + gone, left + pending)
             self._note(oldest + gone, finals[gone:])
             self._note(first, rows)
             return first
 
     def head(self, limit: int) -> Head | None:
-        """What to send next, at most `limit` final samples without a hole between them; None if there is nothing.
+        """The next samples to send: at most `limit` final ones without a gap, or None.
 
-        Runs come one after the other; one that has no samples left is closed with an empty head.
+        Runs follow one another; a run without samples is closed with an empty head.
         """
         with self._access():
             run, end = self._runs[self._sending], self._end(self._sending)
@@ -188,7 +183,7 @@ class Spool:
             return Head(run.spool_id, seq, rows, seq - 1 - run.acknowledged, newest, run.store)
 
     def acknowledge(self, spool_id: int, watermark: int, store: str = "") -> None:
-        """Delete what the server has on disk, of one run, which is bound to that store from then on."""
+        """Delete what the server has on disk of one run, and bind the run to that store."""
         with self._access():
             at = self._index(spool_id)
             run, end = self._runs[at], self._end(at)
@@ -207,10 +202,7 @@ class Spool:
                 self._sending += 1
 
     def lower_watermark(self, spool_id: int, watermark: int) -> None:
-        """Handle a server that knows less than it acknowledged: it was restored from a backup.
-
-        What it has lost is gone here as well: it is declared lost, of this run and of the earlier ones.
-        """
+        """Handle a server restored from a backup; its losses are declared, as the spool no longer has them."""
         with self._access():
             at = self._index(spool_id)
             new = replace(self._runs[at], acknowledged=watermark)
@@ -220,12 +212,12 @@ class Spool:
             self._mark.write(self._run_end(at).values())
 
     def declare_again(self) -> None:
-        """Close all earlier runs once more, each with what was acknowledged of it: the server may have lost some."""
+        """Close all earlier runs again, because the server may have lost journal rows."""
         with self._lock:
             self._sending = 0
 
     def start_new_run(self) -> None:
-        """Give what is not acknowledged of this run a new identity: another agent sends under the present one."""
+        """Renumber unacknowledged samples of this run: another agent sends under the same identity."""
         with self._access():
             old = self._runs[-1]
             new = SpoolRun(old.base + old.acknowledged, self._draw_id())
@@ -245,7 +237,7 @@ class Spool:
                     self._audit.renumbered(old.spool_id, seqs, new.spool_id, _table(row for _, row in waiting))
 
     def quarantine(self, head: Head, problem: str) -> None:
-        """Keep samples that the server will never accept out of the way, for a person to look at."""
+        """Set aside samples that the server refuses for good, for a person to inspect."""
         with self._access():
             run = self._runs[self._index(head.spool_id)]
             first = run.base + head.first_seq
@@ -254,7 +246,7 @@ class Spool:
     def close(self) -> None:
         """Fold the write-ahead log into the file and close."""
         with self._lock:
-            with contextlib.suppress(sqlite3.Error):  # a full disk: the log stays, and is read at the next opening
+            with contextlib.suppress(sqlite3.Error):  # full disk: the next opening reads the log
                 self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._db.close()
             self._mark.close()
@@ -266,7 +258,6 @@ class Spool:
 
     @contextlib.contextmanager
     def _access(self) -> Iterator[None]:
-        """Have the file to oneself; what SQLite cannot do is a StoreError."""
         with self._lock:
             try:
                 yield
@@ -274,32 +265,32 @@ class Spool:
                 raise StoreError(self._path, f"cannot be used: {error}; look at the machine's disk") from None
 
     def _open(self, traces: Traces) -> None:
-        """Make or read the file, name what it has lost, and start a run."""
-        with transaction(self._db):  # all together: a kill leaves all or nothing
+        """Create or read the file, report its losses, and start a run."""
+        with transaction(self._db):  # in one transaction: a kill leaves all or nothing
             make_or_check(self._db)
             self._meta = _Meta(**{k: int(v) for k, v in self._db.execute("SELECT key, value FROM meta")})
             self._runs = self._runs_of_file()
             self.damage = self._compare(traces)
             self._start_run()
-        with contextlib.suppress(OSError):  # it stays behind, which is no alarm
+        with contextlib.suppress(OSError):  # an outdated mark raises no alarm
             self._mark.replace({k: n for i in range(len(self._runs)) for k, n in self._run_end(i).values().items()})
         self._sending = 0  # index of the run that is being sent
-        self._pending = 0  # of this run: its newest samples
+        self._pending = 0  # the newest samples of this run
         self._depth = int(self._db.execute("SELECT COUNT(*) FROM sample").fetchone()[0])
         self._quarantined = int(self._db.execute("SELECT COUNT(*) FROM quarantine").fetchone()[0])
         if self._audit:
             self._audit.complete(self._identified())
 
     def _runs_of_file(self) -> list[SpoolRun]:
-        """Runs that have samples, or had some."""
+        """Runs that have or had samples."""
         runs = [_run_from(*row) for row in self._db.execute("SELECT * FROM run ORDER BY base")]
         return [run for run in runs if run.base < self._meta.newest]
 
     def _compare(self, traces: Traces) -> str:
-        """Compare the file with its mark: runs go as far as they went, so that what is gone is declared to the server.
+        """Compare the file with its mark; runs are extended to their marked end, so that losses are declared.
 
-        Where no log was cut short, a copy may have taken the file's place: what it lacks is counted, and not declared,
-        for the other file may still be sent.
+        If no log was cut short, a copy may have replaced the file. Missing samples are then counted, not declared: the
+        other file may still be sent.
         """
         short = runs_cut_short([self._run_end(i) for i in range(len(self._runs))], traces.mark)
         gone, meta = sum(n for _, n in short), self._meta
@@ -311,13 +302,13 @@ class Spool:
         self._meta = replace(meta, gone=meta.gone + gone)
         self._save(self._meta)
         if traces.damage or gone:
-            with contextlib.suppress(OSError):  # a full disk: it is named all the same
+            with contextlib.suppress(OSError):  # full disk: the damage is reported anyway
                 traces.keep_log(self._meta.newest)
         lost = f"{gone} recorded samples are gone" if gone else ""
         return "; ".join(text for text in (traces.damage, lost) if text)
 
     def _start_run(self) -> None:
-        """Add a run to those that are still of interest: not closed, or among the last."""
+        """Add a run; keep runs that are not closed or among the last."""
         runs, last = self._runs, self._runs[-KEPT_RUNS:]
         first = next((i for i, run in enumerate(runs) if not run.closed or run in last), len(runs))
         self._runs = [*runs[first:], SpoolRun(self._meta.newest, self._draw_id())]
@@ -326,24 +317,21 @@ class Spool:
             self._save_run(run)
 
     def _identified(self) -> Iterator[tuple[int, int, Table]]:
-        """All samples of the file as (spool_id, seq, row)."""
         query = "SELECT number, row FROM sample WHERE number > ? AND number <= ?"
         for i, run in enumerate(self._runs):
             for number, row in self._db.execute(query, (run.base, run.base + self._end(i))):
                 yield run.spool_id, number - run.base, _table([row])[0]
 
     def _end(self, at: int) -> int:
-        """The last seq of a run."""
         is_last = at == len(self._runs) - 1
         return (self._meta.newest if is_last else self._runs[at + 1].base) - self._runs[at].base
 
     @property
     def _held_back(self) -> int:
-        """Samples of the file that are pending."""
         return min(self._pending, self.newest - self.acknowledged)
 
     def _last_final(self, at: int) -> int:
-        """The last seq of a run that may be sent."""
+        """Last seq of a run that may be sent."""
         return self._end(at) - (self._pending if at == len(self._runs) - 1 else 0)
 
     def _run_end(self, at: int) -> RunEnd:
@@ -354,7 +342,6 @@ class Spool:
         return next(i for i, run in enumerate(self._runs) if run.spool_id == spool_id)
 
     def _write(self, rows: Table, finals: Table, oldest: int, pending: int) -> None:
-        """Add samples, and give others, from that number on, their final values; then so many are pending."""
         old, n = self._meta, len(rows)
         added, replaced = _numbered(rows, old.newest + 1), _numbered(finals, oldest)
         excess = max(0, self._depth + n - min(pending, self.newest + n - self.acknowledged) - self._config.max_samples)
@@ -371,7 +358,6 @@ class Spool:
         self._depth += n - excess
 
     def _oldest(self, limit: int) -> list[_SampleRow]:
-        """Final rows of the run that is being sent."""
         base, end = self._runs[self._sending].base, self._last_final(self._sending)
         query = "SELECT * FROM sample WHERE number > ? AND number <= ? ORDER BY number LIMIT ?"
         return self._db.execute(query, (base, base + end, limit)).fetchall()
@@ -382,16 +368,13 @@ class Spool:
             self._db.executemany("INSERT INTO quarantine VALUES (?, ?, ?, ?)", values)
             numbers = [(number,) for number, _ in rows]
             deleted = self._db.executemany("DELETE FROM sample WHERE number = ?", numbers).rowcount
-            if deleted < len(rows):  # a row is read where it cannot be deleted: the file's own structure is damaged
+            if deleted < len(rows):  # readable but not deletable: the file's structure is damaged
                 raise sqlite3.DatabaseError(f"samples {rows[0][0]} and on cannot be removed: the file is damaged")
         self._quarantined += len(values)
         self._depth -= len(values)
 
     def _note(self, first_seq: int, rows: Table) -> None:
-        """Write the audit, if there is one, before they can be sent.
-
-        Lines that a full disk prevents are added at the next opening.
-        """
+        """Audit samples before they can be sent; the next opening adds lines that a full disk prevented."""
         if self._audit and len(rows):
             with contextlib.suppress(OSError):
                 self._audit.recorded(self.spool_id, first_seq, rows)
@@ -406,7 +389,6 @@ class Spool:
 
 
 def _damaged(rows: list[_SampleRow]) -> list[tuple[int, bytes]]:
-    """Those that are not what was written."""
     return [(number, row) for number, row, crc32 in rows if not _is_sound(number, row, crc32)]
 
 
@@ -415,14 +397,12 @@ def _is_sound(number: int, row: object, crc32: int) -> bool:
 
 
 def _run_from(base: int, spool_id: str, acknowledged: int, closed: int, store: str, crc32: int) -> SpoolRun:
-    """A run as the file has it; ValueError where that is not what was written."""
     if crc32 != checksum_of(base, spool_id, acknowledged, closed, store):
         raise ValueError(f"what it knows of samples from {base} on is damaged; move the file away")
     return SpoolRun(base, int(spool_id, 16), acknowledged, bool(closed), store)
 
 
 def _numbered(rows: Table, first: int) -> list[_SampleRow]:
-    """Rows as the file has them, numbered from `first` on."""
     return [(number, data, checksum(number, data)) for number, data in enumerate(map(np.void.tobytes, rows), first)]
 
 

@@ -1,8 +1,4 @@
-"""The spool's file: its tables, how it is opened, and transactions that leave nothing half done.
-
-Its mark has, by run, the last seq that was recorded and the last that was acknowledged, and tells what is gone where
-the file does not reach it.
-"""
+"""The spool's file: tables, opening, transactions, and its mark: last recorded and acknowledged seq of each run."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from pathlib import Path
 from protocol.files import make_private
 
 SCHEMA = 9
-LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
+LOCK_WAIT_S = 1.0  # wait for a predecessor that is still closing the file
 _TABLES = (
     "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
     "CREATE TABLE run (base INTEGER PRIMARY KEY, spool_id TEXT, acknowledged INT, closed INT, store TEXT, crc32 INT)",
@@ -25,11 +21,11 @@ _TABLES = (
     "INSERT INTO meta VALUES ('newest', '0'), ('dropped', '0'), ('recorded', '0'), ('gone', '0')",
     f"PRAGMA user_version={SCHEMA}",
 )
-_ACKNOWLEDGED = " acknowledged"  # after the name of a run
+_ACKNOWLEDGED = " acknowledged"
 
 
 def connect(path: Path, kind: type[sqlite3.Connection] = sqlite3.Connection) -> sqlite3.Connection:
-    """Open a file for this process alone: two agents on one file would send one sample twice, or not at all."""
+    """Open a file exclusively: two agents on one file would send a sample twice, or not at all."""
     make_private(path)
     db = sqlite3.connect(path, LOCK_WAIT_S, isolation_level=None, check_same_thread=False, factory=kind)
     db.execute("PRAGMA locking_mode=EXCLUSIVE")
@@ -37,7 +33,7 @@ def connect(path: Path, kind: type[sqlite3.Connection] = sqlite3.Connection) -> 
 
 
 def make_or_check(db: sqlite3.Connection) -> None:
-    """Write the tables of a new file; ValueError for another schema."""
+    """Create missing tables; ValueError for another schema."""
     if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
         for statement in _TABLES:
             db.execute(statement)
@@ -47,7 +43,7 @@ def make_or_check(db: sqlite3.Connection) -> None:
 
 
 def run_ends_in(db: sqlite3.Connection) -> list[RunEnd]:
-    """Runs that have samples, or had some, as a file at rest has them."""
+    """Runs of a file at rest that have or had samples."""
     (newest,) = db.execute("SELECT value FROM meta WHERE key = 'newest'").fetchone()
     runs = db.execute("SELECT base, spool_id, acknowledged FROM run ORDER BY base").fetchall()
     ends = [*(base for base, _, _ in runs[1:]), int(newest)]
@@ -56,7 +52,7 @@ def run_ends_in(db: sqlite3.Connection) -> list[RunEnd]:
 
 
 def checksum(number: int, row: bytes) -> int:
-    """CRC-32 of a sample and its place."""
+    """CRC-32 of a sample, seeded with its number."""
     return zlib.crc32(row, number & 0xFFFFFFFF)
 
 
@@ -74,40 +70,40 @@ def why_unusable(error: Exception) -> str:
 
 @contextmanager
 def transaction(db: sqlite3.Connection) -> Iterator[None]:
-    """All or nothing; an error rolls back and goes on up, also one of the commit itself."""
+    """All or nothing, also if the commit fails."""
     db.execute("BEGIN IMMEDIATE")
     try:
         yield
         db.execute("COMMIT")
     finally:
-        if db.in_transaction:  # SQLite itself has rolled back after some errors of the disk
+        if db.in_transaction:  # SQLite itself rolls back after some disk errors
             db.execute("ROLLBACK")
 
 
 @dataclass(frozen=True)
 class RunEnd:
-    """How far a run went: the last seq recorded, and the last acknowledged."""
+    """Last recorded and acknowledged seq of a run."""
 
     spool_id: int
     recorded: int
     acknowledged: int
 
     def values(self) -> dict[str, int]:
-        """As a mark has it."""
+        """Entries of the mark."""
         name = f"{self.spool_id:016x}"
         return {name: self.recorded, name + _ACKNOWLEDGED: self.acknowledged}
 
 
 def run_ends(mark: Mapping[str, int]) -> list[RunEnd]:
-    """Undo `RunEnd.values`: the runs in the order in which they began."""
+    """Undo `RunEnd.values`, in order of the runs' start."""
     names = [name for name in mark if not name.endswith(_ACKNOWLEDGED)]
     return [RunEnd(int(name, 16), mark[name], mark.get(name + _ACKNOWLEDGED, 0)) for name in names]
 
 
 def runs_cut_short(there: Iterable[RunEnd], mark: Mapping[str, int]) -> list[tuple[RunEnd, int]]:
-    """Runs that went further than the file says, each with how many samples are gone that nobody acknowledged.
+    """Runs that the mark takes further than the file, each with its lost, unacknowledged samples.
 
-    there: the file's runs, in order. Only its last one can be short, and those after it are not there at all.
+    there: the file's runs in order; only the last can be short.
     """
     *earlier, last = [*there] or [RunEnd(0, 0, 0)]
     known = {run.spool_id for run in earlier}

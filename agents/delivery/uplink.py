@@ -1,11 +1,11 @@
-"""The rules of delivery, first in first out and at least once: a state machine without I/O, clock or threads.
+"""Delivery rules, first in first out and at least once: a state machine without I/O, clock or threads.
 
-Each event returns the next action; whoever carries it out (uplink_thread.py, or a test) reports the result as an event:
+Each event returns the next action; the caller performs it and reports the result:
 
     start_exchange -> ReadHead -> on_head -> Send -> on_reply -> Delete ... -> on_stored -> Wait -> start_exchange
 
-What holds through kills of router, server and agent is a query with payload, a reply after the commit, a watermark, and
-a deletion after the reply. An empty reply means "no server" or "denied", never "done".
+It survives kills of router, server and agent: a reply follows the commit, and deletion the reply. An empty reply means
+"no server" or "denied", never "done".
 """
 
 import math
@@ -21,7 +21,7 @@ from protocol.machine.samples import empty
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
-# The fault lies with the set-up, not with a sample: nothing is quarantined, a person has to mend it.
+# The set-up is at fault, not a sample: a person has to fix it, nothing is quarantined.
 BLOCKING = {
     Refusal.WRONG_FRAME,
     Refusal.WRONG_MACHINE,
@@ -35,14 +35,14 @@ BLOCKING = {
     Refusal.WRONG_TYPE,
     Refusal.COLUMN_LENGTH,
 }
-PASSING = {Refusal.OVERLOADED, Refusal.STORE, Refusal.NOT_WRITER}  # the server will accept the same batch later
-SHARE = 1 / 3  # of the time-out that an exchange should take: a link that gets twice as slow still answers in time
+PASSING = {Refusal.OVERLOADED, Refusal.STORE, Refusal.NOT_WRITER}  # the server will accept this batch later
+SHARE = 1 / 3  # target share of the timeout per exchange: a link that becomes twice as slow still answers in time
 IDLE_S = 0.5  # longest pause without samples
 
 
 @dataclass(frozen=True)
 class UplinkConfig:
-    """timeout_s: how long to wait for an acknowledgement; an exchange is kept to about a third of it."""
+    """timeout_s: deadline of an acknowledgement; exchanges aim at a third of it."""
 
     timeout_s: float = 3.0
 
@@ -53,12 +53,12 @@ class UplinkConfig:
 
 @dataclass(frozen=True)
 class Pacing:
-    """Size of batches and length of pauses.
+    """Batch sizes and pauses.
 
-    first_batch: samples in a batch at first; halved on a time-out, doubled while exchanges stay short. max_batch: a
-    tenth of what a server accepts. backoff_s, max_backoff_s: pause after a failure, doubled each time, of which half to
-    all is used at random: a fleet must not return to a restarted server all at once. gather_s: pause after a batch that
-    left nothing behind, in which samples gather: each batch costs the server a journal row and a sync.
+    first_batch: samples at first; halved on a timeout, doubled while exchanges are short. max_batch: a tenth of the
+    server's limit. backoff_s, max_backoff_s: pause after a failure, doubled each time, randomised to 50 to 100 % so
+    that a fleet does not return to a restarted server at once. gather_s: pause once all is sent, as each batch costs
+    the server a row and a sync.
     """
 
     first_batch: int = 200
@@ -70,11 +70,10 @@ class Pacing:
 
 @dataclass(frozen=True)
 class Head:
-    """What the spool hands over: its oldest final samples, of one run; none where an earlier run is to be closed.
+    """Oldest final samples of one run; without rows, an earlier run to close.
 
-    lost_before: how many directly before them will never be sent. newest: the last sequence number given out, of the
-    run that is being recorded; None for an earlier run. store: id of the store that the run is bound to, empty before
-    one has acknowledged a sample of it.
+    lost_before: samples directly before them that will never be sent. newest: last seq of the current run; None for an
+    earlier run. store: id of the store that the run is bound to, or empty.
     """
 
     spool_id: int
@@ -86,13 +85,13 @@ class Head:
 
     @property
     def acknowledged(self) -> int:
-        """The last sample before the rows that the server has confirmed."""
+        """Last acknowledged seq before the rows."""
         return self.first_seq - 1 - self.lost_before
 
 
 @dataclass(frozen=True)
 class ReadHead:
-    """Read the head of the spool, at most so many samples; the result goes to `on_head`."""
+    """Read up to `limit` samples of the spool's head; the result goes to `on_head`."""
 
     limit: int
 
@@ -106,7 +105,7 @@ class Send:
 
 @dataclass(frozen=True)
 class Delete:
-    """Delete the samples of a run up to a sequence number: the server has them on disk, in this store."""
+    """Delete samples of a run up to a seq: this store has them on disk."""
 
     spool_id: int
     watermark: int
@@ -115,7 +114,7 @@ class Delete:
 
 @dataclass(frozen=True)
 class LowerWatermark:
-    """Remember that the server knows less of a run than it acknowledged: it was restored from a backup."""
+    """Lower a run's watermark: the server was restored from a backup."""
 
     spool_id: int
     watermark: int
@@ -123,17 +122,17 @@ class LowerWatermark:
 
 @dataclass(frozen=True)
 class DeclareAgain:
-    """Close all earlier runs once more: the server has lost journal rows, and does not know of which runs."""
+    """Close all earlier runs again: the server lost rows of unknown runs."""
 
 
 @dataclass(frozen=True)
 class StartNewRun:
-    """Give what is not acknowledged of the present run a new identity: another agent sends under the present one."""
+    """Renumber unacknowledged samples: another agent sends under this identity."""
 
 
 @dataclass(frozen=True)
 class Quarantine:
-    """Keep samples that the server will never accept out of the way, for a person to look at."""
+    """Set aside samples that the server refuses for good."""
 
     head: Head
     problem: str
@@ -147,16 +146,16 @@ class Wait:
     for_samples: bool = False
 
 
-SpoolAction = Delete | LowerWatermark | DeclareAgain | StartNewRun | Quarantine  # when done, `on_stored` is called
+SpoolAction = Delete | LowerWatermark | DeclareAgain | StartNewRun | Quarantine  # `on_stored` follows
 Action = ReadHead | Send | SpoolAction | Wait
 
 
 class Uplink:
     """Delivery of one machine's samples.
 
-    held: why nothing is sent although it could be, empty if it is. problem: what keeps samples from the server now;
-    stuck: the same, where only a person can mend it. ack_s_max: the longest time from the first sending of a batch
-    until samples of it were acknowledged. offer: the last that came for the machine's calibration, None for none.
+    held: why sending is suspended, or empty. problem: what keeps samples from the server now. stuck: the same, if only
+    a person can fix it. ack_s_max: longest time from the first send of a batch to its acknowledgement. offer: latest
+    offered calibration, or None.
     """
 
     def __init__(
@@ -179,20 +178,20 @@ class Uplink:
         self._limit = self._pacing.first_batch
         self._has_met_server = False
         self._failures = 0
-        self._head: Head | None = None  # of the batch under way
-        self._took_s = 0.0  # by its exchange
-        self._unacknowledged_s = 0.0  # since samples were sent that no acknowledgement has answered
-        self._newest_row = ("", 0)  # store, and the last row that it has named
-        self._declares = False  # all runs again, once the present exchange is done
+        self._head: Head | None = None  # of the current batch
+        self._took_s = 0.0
+        self._unacknowledged_s = 0.0  # since the first send without acknowledgement
+        self._newest_row = ("", 0)  # store, and its last row named
+        self._declares = False
 
     def start_exchange(self) -> ReadHead | Wait:
-        """Begin: at the start, and after each pause."""
+        """Start an exchange, first and after each pause."""
         return Wait(IDLE_S, for_samples=True) if self.held else ReadHead(self._limit)
 
     def on_head(self, head: Head | None, spool_id: int) -> Send | Wait:
-        """Send the head of the spool; None if it has none. spool_id: of the run that is being recorded.
+        """Send the spool's head (None: empty). spool_id: of the current run.
 
-        Without samples the first batch is empty: whether the server accepts this machine is known before it has driven.
+        Without samples the first batch is empty: it shows before driving whether the server accepts this machine.
         """
         self._head = head
         if head is None and self._has_met_server:
@@ -202,7 +201,7 @@ class Uplink:
         return Send(encode_batch(SampleBatch(self.machine, *sent)))
 
     def on_reply(self, reply: Ack | Refused | None, took_s: float) -> SpoolAction | Wait:
-        """Act on the reply to the last batch, None for none. took_s: how long the exchange took."""
+        """Handle the last batch's reply (None: silence)."""
         self._took_s = took_s
         self._unacknowledged_s += took_s
         if reply is None:
@@ -210,7 +209,7 @@ class Uplink:
         return self._on_refused(reply) if isinstance(reply, Refused) else self._on_ack(reply)
 
     def on_stored(self, action: SpoolAction) -> SpoolAction | Wait:
-        """End the exchange: the spool has done what was asked of it."""
+        """Finish the exchange: the spool has performed the action."""
         if isinstance(action, LowerWatermark | DeclareAgain | Quarantine):
             return Wait(0.0)
         pause_s = 0.0
@@ -226,19 +225,19 @@ class Uplink:
         return DeclareAgain()
 
     def on_disk_error(self, error: Exception) -> Wait:
-        """The spool could not be read or written."""
+        """Back off: the spool could not be read or written."""
         self.counters["disk_errors"] += 1
         self.problem = str(error)
         return self._back_off()
 
     def on_bug(self, error: Exception) -> Wait:
-        """An action failed in a way that was not foreseen."""
+        """Back off after an unforeseen exception."""
         self.counters["bugs"] += 1
         self.problem = f"the uplink failed: {error!r}; its log has more"
         return self._back_off()
 
     def _on_silence(self) -> Wait:
-        """No reply. It comes at once where there is no server; a link too slow for the batch uses up the time-out."""
+        """Immediate without a server; a link too slow for the batch uses up the timeout."""
         if self._took_s < self.timeout_s / 2:
             self.counters["unanswered"] += 1
             self.problem = "no map server answers; is one running, and does the router let this machine write?"
@@ -253,17 +252,17 @@ class Uplink:
         head, waited_s, self._unacknowledged_s = self._head, self._unacknowledged_s, 0.0
         if head is None:
             return self._succeed(0.0)
-        if head.store and head.store not in (ack.store, ack.replaces):  # what it deleted on that one's word is not here
+        if head.store and head.store not in (ack.store, ack.replaces):  # samples deleted on another store's word
             self.counters["other_store"] += 1
             self.problem = f"store {ack.store} acknowledges samples whose predecessors are in store {head.store}"
             self.stuck = self.problem
             return self._back_off()
         self._compare_row(ack, head)
         self.offer = self.offer if ack.offer is None else ack.offer
-        if not len(head.rows):  # an earlier run is closed, even if the server is older than the run
+        if not len(head.rows):  # close an earlier run, even if the server's store is older
             return Delete(head.spool_id, max(ack.watermark, head.first_seq - 1), ack.store)
         if head.newest is not None and ack.watermark > head.newest:
-            # Only a machine that was copied or set back while it ran, memory and all, gives a number twice.
+            # Only a machine copied or set back while running, memory included, gives a number twice.
             self.counters["new_spool_ids"] += 1
             return StartNewRun()
         if ack.watermark < head.first_seq:
@@ -274,9 +273,9 @@ class Uplink:
         return Delete(head.spool_id, ack.watermark, ack.store)
 
     def _compare_row(self, ack: Ack, head: Head) -> None:
-        """See whether the journal has lost rows: it goes on behind one that it has named, or gives its number again.
+        """Detect lost journal rows: a row number that falls or repeats.
 
-        What it lost of this run it will ask for itself. Of earlier runs only this agent knows.
+        The server asks for this run's losses itself; only this agent knows those of earlier runs.
         """
         store, row = self._newest_row
         is_new = len(head.rows) > ack.trimmed
@@ -290,7 +289,7 @@ class Uplink:
         self.stuck = refused.problem if refused.reason in BLOCKING else ""
         if refused.reason in PASSING and refused.retry_after_s > 0:
             pause_s = min(refused.retry_after_s, self._pacing.max_backoff_s)
-            return Wait(float(pause_s * self._rng.uniform(1.0, 1.5)))  # no sooner, and not all machines at once
+            return Wait(float(pause_s * self._rng.uniform(1.0, 1.5)))  # no sooner, and spread over the fleet
         if refused.reason in PASSING or refused.reason in BLOCKING or head is None or not len(head.rows):
             return self._back_off()
         if refused.reason == Refusal.GAP:
@@ -298,7 +297,7 @@ class Uplink:
                 return self._back_off()
             self.counters["lowered_watermarks"] += 1
             return LowerWatermark(head.spool_id, refused.expected - 1)
-        if len(head.rows) > 1:  # find the sample that is to blame
+        if len(head.rows) > 1:  # bisect for the bad sample
             self._limit = len(head.rows) // 2
             return Wait(0.0)
         return Quarantine(head, refused.problem)
@@ -308,9 +307,9 @@ class Uplink:
         return Wait(pause_s)
 
     def _adapt(self, n: int) -> None:
-        """Fit the size of a batch to the link, by how long the exchange of n samples took."""
+        """Fit the batch size to the link by the duration of an exchange of n samples."""
         target_s, first = SHARE * self.timeout_s, self._pacing.first_batch
-        if self._took_s > target_s and n > first:  # only time-outs go below `first`: the delay may be the link's own
+        if self._took_s > target_s and n > first:  # below `first` only by timeouts: a delay may be the link's own
             self._limit = max(first, int(n * target_s / self._took_s))
         elif self._took_s <= target_s / 2:
             self._limit = min(max(self._limit, 2 * n), self._pacing.max_batch)

@@ -1,4 +1,4 @@
-"""The uplink's thread: it carries out the actions of an `Uplink`, on the spool's file and over Zenoh."""
+"""The uplink's thread performs the actions of an `Uplink` on the spool and over Zenoh."""
 
 import logging
 import threading
@@ -27,13 +27,13 @@ from protocol.wire.messages import Ack, Refused
 
 log = logging.getLogger("agents.delivery.uplink_thread")
 
-Sign = Callable[[str, bytes], bytes]  # key expression and payload to signature
-Check = Callable[[str, bytes, bytes, bytes], bool]  # key expression, payload, reply, signature: whether it is genuine
-Ask = Callable[[bytes], tuple[Ack | Refused | None, float]]  # payload to reply (None: none), and how long it took [s]
+Sign = Callable[[str, bytes], bytes]  # (key expression, payload) to signature
+Check = Callable[[str, bytes, bytes, bytes], bool]  # (key expression, payload, reply, signature) to whether it is valid
+Ask = Callable[[bytes], tuple[Ack | Refused | None, float]]  # payload to (reply or None, duration [s])
 
 
 def perform(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
-    """Carry out an action and return the next one; pauses are up to the caller."""
+    """Perform an action and return the next one; the caller does the pauses."""
     try:
         match action:
             case Wait():
@@ -56,7 +56,7 @@ def perform(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
                 spool.quarantine(head, problem)
                 log.error("quarantined seq=%d problem=%r", head.first_seq, problem)
         return uplink.on_stored(action)
-    except StoreError as error:  # a full or failing disk: the samples wait, the agent goes on
+    except StoreError as error:  # full or failing disk: samples wait, the agent goes on
         return uplink.on_disk_error(error)
 
 
@@ -72,7 +72,7 @@ class UplinkThread:
         sign: Sign | None = None,
         check: Check | None = None,
     ) -> None:
-        """sign: makes the signature that goes beside each batch; check: of that beside each reply."""
+        """Start; `sign` signs each batch, `check` verifies each reply's signature."""
         self._session = session
         self._key = keys.ingest(site, uplink.machine)
         self._uplink = uplink
@@ -86,11 +86,11 @@ class UplinkThread:
         self._thread.start()
 
     def wake(self) -> None:
-        """Announce new samples in the spool."""
+        """Announce new samples."""
         self._new_samples.set()
 
     def close(self) -> None:
-        """Stop, and wait for no reply: the next start learns from the server what it would have said."""
+        """Stop without waiting for a reply; the next start asks the server again."""
         self._stop.set()
         self._new_samples.set()
         self._cancel.cancel()  # type: ignore[no-untyped-call]
@@ -104,12 +104,12 @@ class UplinkThread:
                     self._pause(action)
                 action = perform(action, self._uplink, self._spool, self._ask)
                 self._tell()
-            except Exception as error:  # a bug must not end the thread, and with it all delivery, without a word
+            except Exception as error:  # a bug must not silently end delivery
                 log.exception("uplink failed")
                 action = self._uplink.on_bug(error)
 
     def _tell(self) -> None:
-        """Log what a person has to mend, once: it does not pass by itself, as a link that is down does."""
+        """Log once what a person has to fix, unlike a link that recovers by itself."""
         if (stuck := self._uplink.stuck) and stuck != self._logged:
             log.error("samples wait problem=%r", stuck)
         self._logged = stuck
@@ -119,7 +119,7 @@ class UplinkThread:
             self._new_samples.wait(pause.seconds)
         elif pause.seconds > 0:
             self._stop.wait(pause.seconds)
-        self._new_samples.clear()  # the head is read after this: no sample is overlooked
+        self._new_samples.clear()  # before the head is read, so no sample is overlooked
 
     def _ask(self, payload: bytes) -> tuple[Ack | Refused | None, float]:
         start_s = time.monotonic()
@@ -143,7 +143,7 @@ class UplinkThread:
         return None
 
     def _believed(self, payload: bytes, reply: zenoh.Sample) -> Ack | Refused:
-        """What a reply says, if the map server has signed it; a forged one could have samples deleted."""
+        """The reply, if the map server has signed it: a forged one could delete samples."""
         data = reply.payload.to_bytes()
         signature = reply.attachment.to_bytes() if reply.attachment else b""
         if self._check and not self._check(self._key, payload, data, signature):
@@ -153,7 +153,7 @@ class UplinkThread:
 
 
 def linger(is_empty: Callable[[], bool], wait: Callable[[float], object], clock: Callable[[], float], s: float) -> bool:
-    """Wait until the spool is empty, at most `s` seconds; returns whether it is."""
+    """Wait at most `s` seconds for an empty spool; returns whether it is empty."""
     end_s = clock() + s
     while not is_empty():
         if clock() >= end_s:

@@ -1,7 +1,6 @@
-"""Samples on their way to the spool: new ones, and final values of those that lie there as pending.
+"""New samples and final values on their way to the spool.
 
-They are written together once in a while, as each write costs a sync of the machine's disk, and wait here while it
-takes nothing.
+Each write costs a sync, so they are written together, and wait while the disk accepts nothing.
 """
 
 import numpy as np
@@ -10,29 +9,29 @@ from agents.delivery.spool import Spool
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 
-MOST_UNSAVED = 100_000  # samples that wait in memory while the disk is full or fails
+MOST_UNSAVED = 100_000  # capacity in samples while the disk is full or fails
 
 
 class WriteBuffer:
-    """What is not on disk yet. given_up: samples that memory could not hold either."""
+    """What is not on disk yet. given_up: samples dropped for lack of memory."""
 
     def __init__(self) -> None:
         self.given_up = 0
-        self._new, self._final = empty(), 0  # the first so many of the new ones are final
-        self._finals = empty()  # of the oldest pending samples in the spool
-        self._pending = 0  # samples in the spool that have no final value, here neither
+        self._new, self._final = empty(), 0  # new samples; the number of final ones
+        self._finals = empty()  # final values of the oldest pending samples in the spool
+        self._pending = 0  # samples in the spool still without a final value
 
     def __len__(self) -> int:
         return len(self._new)
 
     @property
     def is_clean(self) -> bool:
-        """Whether all is on disk."""
+        """Whether everything is on disk."""
         return not len(self._new) and not len(self._finals)
 
     def add(self, pending: Table, finals: Table) -> None:
-        """Add new samples, and final values of those that have been pending longest; order is all that joins them."""
-        if not len(pending) and not len(finals):  # as in most calls: joining copies all that waits
+        """Add new samples, and final values of those pending longest, matched by order."""
+        if not len(pending) and not len(finals):  # the usual case; concatenation copies all that waits
             return
         in_spool = min(len(finals), self._pending)
         self._finals = np.concatenate([self._finals, finals[:in_spool]])
@@ -44,7 +43,7 @@ class WriteBuffer:
             self._new, self._final, self.given_up = self._new[excess:], self._final - excess, self.given_up + excess
 
     def write(self, spool: Spool) -> int:
-        """Write all to the spool; returns how many new samples that were. StoreError if it takes nothing: all stays."""
+        """Write everything; returns the number of new samples. StoreError keeps all."""
         n, pending = len(self._new), len(self._new) - self._final
         spool.record(self._new, pending=pending, finals=self._finals)
         self._new, self._final, self._finals = empty(), 0, empty()

@@ -1,22 +1,19 @@
-"""Slope along and across the machine: where the vertical points in the body's axes, by gyros, accelerometer and wheels.
+"""Slope along and across the machine: the vertical in body axes, by gyros, accelerometer and wheels.
 
-With u the vertical in the body's axes (ahead, left, up), omega the rates of the gyros, f the specific force that the
-accelerometer measures with its zero z, and v the velocity of the place where it sits,
+u: vertical in body axes (ahead, left, up); omega: gyro rates; f: specific force by an accelerometer of bias z; v:
+velocity at its mount:
 
     du/dt = -omega x u          dv/dt = f - g (u + z) - omega x v
 
-The gyros turn u; the forces are summed up to a velocity, and the wheels say what it should be: their speed ahead, none
-to the side, but for what turning adds at the sensor and for tyres, which slip outwards in a bend. Wheel travel is not
-differentiated twice: an acceleration that comes late is a slope that is not there. A machine that turns tells a zero,
-which turns with it, from a slope, which stays, and the slip of its tyres from both: it comes and goes with the bend.
-
-By the linear tyre model the angle of slip goes with the sideways acceleration a = omega_z v_x, by k,
+Gyros turn u. Integrated forces are compared with the wheels' velocity: their speed ahead, none sideways but for turning
+at the sensor and tyre slip. Wheel travel is not differentiated twice: a late acceleration looks like a slope. In turns
+bias moves along and slope does not; slip comes and goes with the bend. By the linear tyre model the slip angle is k
+times the sideways acceleration a = omega_z v_x:
 
     v_y = -k a |v_x|            dv_x/dt = ... - k a^2 sign(v_x)
 
-Where wheels say nothing, speeds over ground by GPS take their place ahead, each with a variance of its own.
-
-The parts of u ahead and to the left are the sines of the two slopes, positive uphill.
+GPS speeds replace missing wheels ahead, each with its variance. u ahead and left is the sine of each slope, positive
+uphill.
 """
 
 import math
@@ -27,34 +24,32 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 
-MAX_SINE = 0.7  # steeper than any machine stands
-FIRST_STD = 0.05  # of the sine, after the first reading
-FIRST_SPEED_STD_MPS = 5.0  # of a machine whose wheels have said nothing yet
-RATE_WALK = 3e-4  # random walk of the angle that the gyros do not see [rad/sqrt(s)]: a cheap gyro, 0.17 deg/s at 100 Hz
-BIAS_STD_RADPS = 2e-3  # of the gyro bias at start: 0.1 deg/s
-BIAS_WALK = 3.5e-5  # random walk of the gyro bias [rad/s/sqrt(s)]: another 0.1 deg/s in an hour
-ZERO_STD = 0.01  # of the accelerometer's zero at start, over g: an uncalibrated one
-ZERO_WALK = 1e-4  # random walk of that zero [1/sqrt(s)]: most of it again in an hour
-FORCE_WALK = 0.05  # of the summed forces [m/s/sqrt(s)]: vibration of 0.35 m/s2, white over 20 ms
-SPEED_WALK = 0.027  # noise of the wheels' speed [m/s sqrt(s)]: 0.05 m/s, shared by readings over 0.3 s
-# Wheels that jump by more than this against the forces slip, or grip again: that says nothing about the slope. One
-# sigma is rare: noise is shared by readings that are counted as if it were each one's own. A speed over ground does not
-# slip, but it has outliers.
+MAX_SINE = 0.7  # upper bound of the sine; no machine stands steeper
+FIRST_STD = 0.05  # initial standard deviation of the sine
+FIRST_SPEED_STD_MPS = 5.0  # initial standard deviation before wheels report
+RATE_WALK = 3e-4  # random walk of the angle [rad/sqrt(s)]: a cheap gyro, 0.17 deg/s at 100 Hz
+BIAS_STD_RADPS = 2e-3  # initial gyro bias: 0.1 deg/s
+BIAS_WALK = 3.5e-5  # random walk of the gyro bias [rad/s/sqrt(s)]: 0.1 deg/s per hour
+ZERO_STD = 0.01  # initial accelerometer bias over g, uncalibrated
+ZERO_WALK = 1e-4  # random walk of that bias [1/sqrt(s)]: about ZERO_STD again in an hour
+FORCE_WALK = 0.05  # of integrated forces [m/s/sqrt(s)]: vibration of 0.35 m/s2, white over 20 ms
+SPEED_WALK = 0.027  # noise of wheel speed [m/s sqrt(s)]: 0.05 m/s, correlated over 0.3 s
+# Wheel speeds that jump by more than this against the forces slip or grip again, and say nothing of slope. One sigma,
+# because correlated noise counts as independent. Speed over ground does not slip, but has outliers.
 JUMP_SIGMA, OUTLIER_SIGMA = 1.0, 3.0
-MAX_JUMPS_S = 3.0  # at every step: wheels do not slip like that, the slope is wrong, after a knock or a fault
-SLIP_STD = 0.03  # of the tyres' angle of slip per sideways acceleration at start [rad s2/m]: 0.01 firm, 0.03 on sand
-SLIP_WALK = 1e-3  # random walk of that [rad s2/m/sqrt(s)]: another ground in a quarter of an hour
-MAX_LATERAL_MPS2 = 5.0  # of sideways acceleration: tyres hold no more
-SINES, BIASES, ZEROS, SPEEDS = (slice(i, i + 2) for i in (0, 2, 4, 6))  # of the state, each ahead and to the left
+MAX_JUMPS_S = 3.0  # jumps at every step for this long mean a wrong slope, after a shock or fault
+SLIP_STD = 0.03  # initial slip angle per sideways acceleration [rad s2/m]: 0.01 firm, 0.03 on sand
+SLIP_WALK = 1e-3  # its random walk [rad s2/m/sqrt(s)]: other ground in a quarter of an hour
+MAX_LATERAL_MPS2 = 5.0  # upper bound of sideways acceleration that tyres hold
+SINES, BIASES, ZEROS, SPEEDS = (slice(i, i + 2) for i in (0, 2, 4, 6))  # slices of the state, each ahead and left
 SLIP = 8
 
 
 class SlopeFilter:
-    """Sines of the slopes ahead and to the left by a Kalman filter, of one IMU.
+    """Kalman filter of the sines of the slopes ahead and to the left, for one IMU.
 
-    State: both sines, biases of the rates at which these change [rad/s], zeros of the accelerometer over g, speeds
-    [m/s], and the angle at which tyres slip per sideways acceleration [rad s2/m]. Turning couples the directions: the
-    slope ahead becomes the one across.
+    State (9,): both sines, biases of their rates [rad/s], accelerometer biases over g, speeds [m/s], and tyre slip
+    angle per sideways acceleration [rad s2/m]. Turning couples the directions.
     """
 
     def __init__(self) -> None:
@@ -63,7 +58,7 @@ class SlopeFilter:
             _state([FIRST_STD, BIAS_STD_RADPS, ZERO_STD, FIRST_SPEED_STD_MPS], SLIP_STD) ** 2
         )
         self._is_started = False
-        self._jumps_s = 0.0  # for so long at every step
+        self._jumps_s = 0.0  # duration of uninterrupted jumps
 
     @property
     def ahead(self) -> float:
@@ -77,17 +72,17 @@ class SlopeFilter:
 
     @property
     def shown_ahead(self) -> float:
-        """Sine of the slope ahead as the accelerometer shows it: its zero, which calibration knows, is in it."""
+        """Sine of the slope ahead including accelerometer bias."""
         return _bounded(self._x[0] + self._x[4])
 
     @property
     def variance(self) -> float:
-        """Variance of `shown_ahead`."""
+        """Of `shown_ahead`."""
         P = self._covariance
         return float(P[0, 0] + 2 * P[0, 4] + P[4, 4])
 
     def restart(self) -> None:
-        """After a pause or a knock: slopes and speeds are others; biases and zeros are not."""
+        """Restart slopes and speeds after a pause or shock; biases remain."""
         self._is_started = False
 
     def update(
@@ -98,11 +93,10 @@ class SlopeFilter:
         speed_mps: Sequence[float | None] | None,
         variance: float | None = None,
     ) -> None:
-        """Predict with means over dt_s, correct with the speed at its end; None: it is not known.
+        """Predict with means over dt_s; correct with the speed at its end (None: unknown).
 
-        rates_radps: about the axes ahead, left and up. force_mps2: ahead and to the left, what changes the speeds and
-        gravity's share, without omega x v. speed_mps: ahead and to the left, at the sensor. variance: of the speed
-        ahead, None of wheels.
+        rates_radps: about ahead, left, up. force_mps2: ahead and left, with gravity, without omega x v. speed_mps:
+        ahead and left, at the sensor. variance: of the speed ahead, None for wheels.
         """
         if not self._is_started:
             self._start(force_mps2)
@@ -115,7 +109,6 @@ class SlopeFilter:
                 self.restart()
 
     def _start(self, force_mps2: Sequence[float]) -> None:
-        """Believe the accelerometer."""
         P = self._covariance
         for i, first in ((SINES, FIRST_STD), (SPEEDS, FIRST_SPEED_STD_MPS)):
             P[i], P[:, i] = 0.0, 0.0
@@ -142,20 +135,20 @@ class SlopeFilter:
         F[6, SLIP] = -bend_mps
         P = F @ self._covariance @ F.T
         P.flat[::10] += dt_s * _WALKS**2
-        self._covariance = 0.5 * (P + P.T)  # rounding does not add up over hours
+        self._covariance = 0.5 * (P + P.T)  # keeps rounding symmetric over hours
 
     def _correct(
         self, lateral_mps2: float, speed_mps: Sequence[float | None], noise: float, variance_ahead: float | None
     ) -> bool:
-        """Correct both speeds, of those that are known; returns whether one of them jumped."""
+        """Correct by the known speeds; returns whether one jumped."""
         P, jumped, (ahead, left) = self._covariance, False, speed_mps
-        slips_mps = -lateral_mps2 * abs(ahead if ahead is not None else self._x[6])  # per state of slip: to the left
+        slips_mps = -lateral_mps2 * abs(ahead if ahead is not None else self._x[6])  # sideways, per unit of slip
         of_ahead = (noise, JUMP_SIGMA) if variance_ahead is None else (variance_ahead, OUTLIER_SIGMA)
         both = (6, ahead, 0.0, *of_ahead), (7, left, -slips_mps, noise, JUMP_SIGMA)
         for i, speed, shown, white, sigma in both:
             if speed is None:
                 continue
-            seen = P[:, i] + shown * P[:, SLIP]  # covariance with what they show
+            seen = P[:, i] + shown * P[:, SLIP]
             variance = float(seen[i] + shown * seen[SLIP])
             innovation = speed - float(self._x[i] + shown * self._x[SLIP])
             beyond = innovation**2 - sigma**2 * (variance + white)
@@ -170,12 +163,11 @@ class SlopeFilter:
         return jumped
 
     def _lateral_mps2(self, about_z_radps: float) -> float:
-        """Sideways acceleration, to the left [m/s2]."""
         return max(-MAX_LATERAL_MPS2, min(MAX_LATERAL_MPS2, about_z_radps * float(self._x[6])))
 
 
 def _state(of_both: Sequence[float], of_slip: float) -> Floats:
-    """A number per part of the state, the same ahead and to the left, (9,)."""
+    """A value per part of the state, equal ahead and left, (9,)."""
     return np.append(np.repeat(of_both, 2), of_slip)
 
 

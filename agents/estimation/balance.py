@@ -1,18 +1,16 @@
-"""From readings to steps of the force balance: drive force over weight, less what the motion takes.
+"""Readings to steps of the force balance: drive force over weight, less what the motion takes.
 
-With F the drive force, f the specific force ahead at `base_link`, a the wheels' acceleration, m the mass with
-payload, m_0 the one without, and lambda the rotating mass factor, which is stated of m_0: a load does not rotate,
+F: drive force; f: specific force ahead at `base_link`; a: wheel acceleration; m, m_0: mass with and without payload;
+lambda: rotating mass factor of m_0, as loads do not rotate:
 
     F / (m g) - (f - g squat) / g - (lambda - 1) (m_0 / m) a / g  =  direction c_rr cos(slope)
 
-F is what wheels, engine or motor state (`powertrain`), less what they do not see: friction between them and the wheels,
-brakes whose force is read, and the drag of the air, rho c_d A v^2 / 2.
+F comes from wheels, engine or motor (`powertrain`), less friction behind them, measured brake forces and air drag, rho
+c_d A v^2 / 2. The grade cancels: the accelerometer measures gravity's share too.
 
-The accelerometer measures gravity's share of the slope as well, so the grade cancels.
-
-Squat is the pitch that payload and longitudinal force add to that of the ground. Axle loads of a rigid body in balance,
-N_f = m (g cos(slope) l_c - f h) / L and N_r = m g cos(slope) - N_f, press tyres of stiffness k per axle by N / k; the
-nose rises by (N_r - N_f) / (k L). The empty machine stands level: its own pitch is subtracted.
+Squat is the pitch due to payload and longitudinal force. Axle loads of a rigid body, N_f = m (g cos(slope) l_c - f h) /
+L and N_r = m g cos(slope) - N_f, compress tyres of stiffness k per axle by N / k. The nose rises by (N_r - N_f) / (k
+L), less that of the empty machine on level ground.
 """
 
 import math
@@ -28,13 +26,13 @@ from protocol.machine.machine_config import BASE, MachineConfig, Mount, SensorCo
 from protocol.machine.readings import Articulation, Brake, BrakeForce, Imu, Payload, Reading
 from protocol.units import GRAVITY_MPS2
 
-STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
-MAX_PAUSE_S = 1.0  # of the IMU, or of readings of wheels and brakes, before their last values no longer count
-MAX_GAP_NS = 300_000_000  # what follows balances is interrupted where there is none for so long
-MAX_GROUND_NS = 2_000_000_000  # and so of a speed over ground, of which there may be one a second
-SLOW_MPS = 2.0  # a slower machine pitches by its own forces rather than by the ground
-MOVES_MPS = 0.2  # a slower machine is held by friction and brakes, nobody knows which way
-AIR_KGPM3 = 1.2  # density of the air near the ground
+STEP_NS = 50_000_000  # balance step: short enough to date a border, long enough to average vibration
+MAX_PAUSE_S = 1.0  # age at which readings of IMU, wheels or brakes expire
+MAX_GAP_NS = 300_000_000  # gap between balances that interrupts consumers
+MAX_GROUND_NS = 2_000_000_000  # age at which speed over ground, about one a second, expires
+SLOW_MPS = 2.0  # below it, its own forces pitch a machine, not the ground
+MOVES_MPS = 0.2  # below it, friction and brakes act in an unknown direction
+AIR_KGPM3 = 1.2  # air density
 NO_SUMS = (0.0,) * 8
 
 
@@ -42,15 +40,13 @@ NO_SUMS = (0.0,) * 8
 class Balance:
     """One step of the force balance.
 
-    speed_mps, accel_mps2, distance_m: of the wheels, speed_mps else over ground; distance_m counts up in reverse too.
-    speed_std_mps: of the wheels' resolution and noise. unbalanced: the left side of the equation, share: what the
-    torque sensor states of F / (m g), both [-] and signed ahead. slope_x, slope_y: angles ahead and to the left [rad]
-    with their variance, as the body has them, without squat; sine_x: of the one ahead, by the accelerometer alone.
-    pitch_radps: rate of the pitch, nose up positive. yaw_radps: of the turn to the left. norm_mps2: of the specific
-    force. on_front: share of the load on the front axle, 0 if not known. body_mps2: acceleration ahead by the
-    accelerometer. torque_s, wheels_s: age of their newest reading. mass_kg: with payload. brake: how much of a brake is
-    applied whose force nobody reads, 0 to 1; NaN of a machine without any reading of its brakes. share_var: of share,
-    by the torque's steps. unknown: why the drive force is not known, "" where it is.
+    speed_mps, accel_mps2, distance_m: of the wheels, speed else over ground; distance also counts up in reverse.
+    speed_std_mps: by resolution and noise. unbalanced: left side of the equation; share: measured F / (m g); both [-],
+    signed ahead. slope_x, slope_y, slope_var: of the body ahead and left without squat [rad, rad2]; sine_x: ahead by
+    the accelerometer alone. pitch_radps: nose up. yaw_radps: left. norm_mps2: of the specific force. on_front: load
+    share of the front axle, 0 if unknown. body_mps2: acceleration ahead by the accelerometer. torque_s, wheels_s: age
+    of the newest reading. mass_kg: with payload. brake: applied share of a brake without force reading, 0 to 1; NaN
+    without any brake reading. share_var: of share, by torque steps. unknown: why the drive force is unknown, or "".
     """
 
     stamp_ns: int
@@ -87,10 +83,9 @@ class Balance:
 class BalanceStep:
     """One usable step of the force balance: raw = direction cos(slope) c_rr + scale error * share.
 
-    stamp_ns: of its end; dt_s; distance_m: driven since the last usable step. raw: with the calibration applied [-].
-    regressor: direction cos(slope) [-]. share: drive force over weight, signed ahead [-]. lead_share: share of the load
-    that the leading axle carries; wheelbase_m: how far the trailing axle is behind it; lead_m: how far the load centre
-    is. Without a wheelbase, all wheels stand on the same ground. share_var: of share, by the torque's steps.
+    stamp_ns: its end. distance_m: since the last usable step. raw: calibrated [-]. regressor: direction cos(slope) [-].
+    share: drive force over weight, signed ahead [-]; share_var: by torque steps. lead_share: load share of the leading
+    axle; wheelbase_m, lead_m: trailing axle and load centre behind it; without a wheelbase, one ground.
     """
 
     stamp_ns: int
@@ -106,10 +101,7 @@ class BalanceStep:
 
 
 class Balancer:
-    """Collects readings into balances of STEP_NS.
-
-    weighs: whether payload readings count; else the mass is the machine's own.
-    """
+    """Collects readings into balances of STEP_NS. weighs: whether payload readings add to the machine's mass."""
 
     def __init__(self, machine: MachineConfig, *, weighs: bool) -> None:
         self.payload_kg = 0.0
@@ -120,25 +112,25 @@ class Balancer:
         self._rotation: dict[str, Floats] = {}
         self._sensor: str | None = None
         self._imu_ns = self._begin_ns = self._wheels_ns = self._ground_ns = 0
-        # Count; force ahead at base_link, norm; rates about x, y, z; forces ahead and left that change the speed.
+        # Count; force ahead at base_link; norm; rates about x, y, z; forces ahead and left that change the speed.
         self._imu_sums = NO_SUMS
-        self._rolls = False  # whether wheels said something in this step
+        self._rolls = False
         self._drive = DriveReadings(machine)
         self._brakes: dict[str, Brake] = {}
         self._brake_forces: dict[str, BrakeForce] = {}
 
     @property
     def mass_kg(self) -> float:
-        """Of the machine and its payload."""
+        """With payload."""
         return self._machine.mass_kg + self.payload_kg
 
     @property
     def is_before_wheels(self) -> bool:
-        """Whether engine or motor state the drive."""
+        """Whether engine or motor measures the drive."""
         return self._drive.is_before_wheels
 
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> Balance | None:
-        """Add a reading, after dead reckoning did; returns the balance of the step that it ends."""
+        """Add a reading, after dead reckoning; returns the balance it completes."""
         if self._drive.add(reading):
             return None
         if isinstance(reading, Brake):
@@ -154,7 +146,7 @@ class Balancer:
         return None
 
     def _is_in_use(self, sensor: SensorConfig) -> bool:
-        """Whether it is the first IMU on the rear frame that has an accelerometer."""
+        """Whether it is the first rear-frame IMU with an accelerometer."""
         return sensor.frame == BASE and sensor.provides("force") and self._sensor in (None, sensor.name)
 
     def _add_imu(self, imu: Imu, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> Balance | None:
@@ -163,7 +155,7 @@ class Balancer:
             self._imu_ns = self._begin_ns = imu.stamp_ns
             return None
         dt_s, self._imu_ns = (imu.stamp_ns - self._imu_ns) * 1e-9, imu.stamp_ns
-        if not 0 < dt_s < MAX_PAUSE_S:  # start from here
+        if not 0 < dt_s < MAX_PAUSE_S:  # restart here
             self._begin_ns, self._imu_sums = imu.stamp_ns, NO_SUMS
             self._drive.restart()
             self._slope.restart()
@@ -175,7 +167,7 @@ class Balancer:
         rolls = wheels.is_known and self._wheels_s() < MAX_PAUSE_S
         ground = self._fresh(dead_reckoning.ground) if not rolls and dead_reckoning.is_silent(imu.stamp_ns) else None
         accel, speed = (wheels.accel_mps2, wheels.speed_mps) if rolls else (0.0, ground.speed_mps if ground else 0.0)
-        at_base = ahead + (wy**2 + wz**2) * x_m  # without what turning adds at the sensor's place
+        at_base = ahead + (wy**2 + wz**2) * x_m  # without the centripetal part at the sensor's mount
         vx, vy, vz = speed + wz * (wheels.offset_m - y_m) + wy * z_m, wz * x_m - wx * z_m, wx * y_m - wy * x_m
         self._rolls = rolls and self._wheels_ns > self._begin_ns
         norm, turned = math.hypot(ahead, left, up), (ahead - wy * vz + wz * vy, left - wz * vx + wx * vz)
@@ -193,7 +185,7 @@ class Balancer:
         rate = -about_y  # the nose rises
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
         self._imu_sums, drive = NO_SUMS, self._drive.take(speed)
-        # At the sensor, with mean rates: those of one reading shake. None sideways, with wheels or without.
+        # At the sensor, with mean rates because single ones shake; no sideways speed, with wheels or without.
         x_m, y_m, z_m = mount.xyz_m
         ahead = speed + about_z * (dead_reckoning.wheels.offset_m - y_m) + about_y * z_m
         is_new = ground.stamp_ns > self._ground_ns if ground else self._rolls
@@ -236,7 +228,7 @@ class Balancer:
         )
 
     def _unseen_n(self, speed_mps: float) -> float:
-        """Force against the motion that the torque sensor does not see, as far as it is known; signed ahead."""
+        """Known force against the motion beyond the torque sensor's, signed ahead."""
         if abs(speed_mps) < MOVES_MPS:
             return 0.0
         drag_n = AIR_KGPM3 * self._machine.drag_area_m2 * speed_mps**2 / 2
@@ -244,7 +236,6 @@ class Balancer:
         return math.copysign(drag_n + self._machine.drive_friction_n + brakes_n, speed_mps)
 
     def _brake(self) -> float:
-        """How much of a brake is applied; NaN where no sensor of brakes speaks any more."""
         applied = [brake.applied for brake in self._brakes.values() if self._is_fresh(brake)]
         reads_force = any(map(self._is_fresh, self._brake_forces.values()))
         return max(applied, default=0.0 if reads_force else math.nan)
@@ -256,23 +247,23 @@ class Balancer:
         return ground if ground and self._imu_ns - ground.stamp_ns < MAX_GROUND_NS else None
 
     def _ground_variance(self, ground: GroundSpeed, force_mps2: float) -> float:
-        """Variance of a speed over ground [m2/s2], with what the machine has sped up since."""
+        """Variance of a speed over ground [m2/s2], including acceleration since it was measured."""
         accel_mps2 = force_mps2 - GRAVITY_MPS2 * self._slope.shown_ahead
         return ground.std_mps**2 + (accel_mps2 * (self._imu_ns - ground.middle_ns) * 1e-9) ** 2
 
     def _climb_of_bend(self, on_front: float, squat: float) -> float:
-        """Sine of the slope of the front frame of a bent machine, less that of the rear one, by the front's load [-].
+        """Sine of the slope of a bent machine's front frame less the rear's, by the front's load [-].
 
-        Gravity acts on each axle's load along that axle's own direction; the accelerometer measures the rear one's.
+        Gravity acts along each axle's direction; the accelerometer measures the rear one's.
         """
         c, s = math.cos(self._bend_rad), math.sin(self._bend_rad)
         return on_front * ((self._slope.ahead - squat) * (c - 1) + self._slope.left * s)
 
     def _climb_of_curve(self, on_front: float, pitch_radps: float, speed_mps: float) -> float:
-        """Sine of the slope under both axles, by their loads, less that of the line from one to the other [-].
+        """Load-weighted sine of the slope under both axles less that of their line, which is measured [-].
 
-        The accelerometer measures the line's. Where the slope changes with the way, by pitch rate over speed per metre,
-        the front axle's is half a wheelbase's change steeper, the rear one's as much less steep.
+        The slope changes by pitch rate over speed per metre: the front axle's is half a wheelbase's change steeper, the
+        rear's less.
         """
         faster_mps = math.copysign(max(abs(speed_mps), SLOW_MPS), speed_mps)
         return (on_front - 0.5) * self._machine.wheelbase_m * pitch_radps / faster_mps
@@ -282,10 +273,7 @@ class Balancer:
 
 
 def front_share(machine: MachineConfig, payload_kg: float, force_mps2: float) -> float:
-    """Share of the load on the front axle [-]; 0 where the machine's data are missing.
-
-    force_mps2: specific force ahead, gravity's share included.
-    """
+    """Load share of the front axle [-]; 0 if machine data are missing. force_mps2: specific, ahead, with gravity."""
     if not machine.wheelbase_m:
         return 0.0
     ahead = machine.mass_kg * machine.load_centre_m + payload_kg * machine.payload_x_m  # first moments of mass
@@ -295,15 +283,15 @@ def front_share(machine: MachineConfig, payload_kg: float, force_mps2: float) ->
 
 
 def squat_rad(machine: MachineConfig, payload_kg: float, force_mps2: float) -> float:
-    """Nose-up angle [rad] against the empty machine at rest on the level; 0 where the machine's data are missing."""
+    """Nose-up angle [rad] less the empty machine's on level ground; 0 if machine data are missing."""
     if not (machine.wheelbase_m and machine.axle_stiffness_npm):
         return 0.0
     weight_n = (machine.mass_kg + payload_kg) * _down(force_mps2)
-    rear_n = weight_n * (1 - 2 * front_share(machine, payload_kg, force_mps2))  # more than on the front
+    rear_n = weight_n * (1 - 2 * front_share(machine, payload_kg, force_mps2))  # excess over the front axle's
     empty_n = machine.mass_kg * GRAVITY_MPS2 * (1 - 2 * front_share(machine, 0.0, 0.0))
     return (rear_n - empty_n) / (machine.axle_stiffness_npm * machine.wheelbase_m)
 
 
 def _down(force_mps2: float) -> float:
-    """Gravity's share across the slope that a steady machine with this force stands on [m/s2]."""
+    """Gravity across the slope on which a steady machine measures this force [m/s2]."""
     return math.sqrt(max(GRAVITY_MPS2**2 - force_mps2**2, 1.0))

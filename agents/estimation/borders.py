@@ -1,14 +1,11 @@
-"""Where the ground under a machine changed: of all histories of borders, the likeliest by all steps so far.
+"""Where the ground changed: the likeliest history of borders, given all steps so far.
 
-A history is begun with every step that may be the first one on a new ground, and the likeliest are kept: what lies
-before a border says nothing of the ground behind it, so that of all histories that end with the same border the
-likeliest is the only one that can win (Fearnhead and Liu 2007, On-line inference for multiple changepoint problems,
-with maxima in place of sums). Each has a Kalman filter of its own. With l, t the c_rr under the leading and the
-trailing axle and w the leading one's share of the load, a step measures regressor (w l + (1 - w) t) + noise; a border
-makes l unknown, and t becomes l once the trailing axle has come up. The score of a history is the logarithm of how
-likely its measurements and its borders are.
-
-So a border is where all that came behind it says it was, and is taken back when more steps speak against it.
+Every step may begin new ground, and thus a history. What lies before a border says nothing of the ground behind it, so
+of histories with the same last border only the likeliest can win (Fearnhead and Liu 2007, On-line inference for
+multiple changepoint problems, with maxima for sums). Each has a Kalman filter of l, t, the c_rr under leading and
+trailing axle; with the leading load share w, a step measures regressor (w l + (1 - w) t) + noise. A border makes l
+unknown; t becomes l once the trailing axle is across. The score is the log-likelihood of measurements and borders.
+Later steps may move a border or remove it.
 """
 
 from __future__ import annotations
@@ -20,14 +17,14 @@ import numpy as np
 from agents.estimation.balance import BalanceStep
 from agents.estimation.tuning import TUNING, EstimationTuning
 
-MOST, KEPT = 80, 60  # histories at most; of more, so many of the likeliest
-# What a row of the histories has: l, t, their variances and covariance, the score, and how far the trailing axle is
-# from the last border [m], 0 or less once it has come up.
+MOST, KEPT = 80, 60  # most histories, and survivors of pruning
+# Rows: l, t, their variances and covariance, score, and the trailing axle's distance to the last border [m], 0 or less
+# once across.
 LEAD, TRAIL, LEAD_VAR, COVARIANCE, TRAIL_VAR, SCORE, BEHIND_M = range(7)
 
 
 class BorderSearch:
-    """Searches for borders step by step. remembered: of how many steps the borders are of interest."""
+    """Searches for borders. remembered: number of steps whose borders are reported."""
 
     def __init__(self, remembered: int, tuning: EstimationTuning = TUNING) -> None:
         self._remembered, self._tuning = remembered, tuning
@@ -39,9 +36,9 @@ class BorderSearch:
         self._direction = 0.0
 
     def update(self, number: int, step: BalanceStep, raw: float, r: float) -> tuple[int, ...]:
-        """Take in a step; returns the numbers of the steps that begin a new ground, ascending.
+        """Add a step; returns the numbers of the steps that begin new ground, ascending.
 
-        number: of the step, counted up. raw: of the step, without the scale error; r: variance of its white noise.
+        number: of the step, increasing. raw: without the scale error; r: variance of its white noise.
         """
         self._turn(step.regressor)
         self._branch(number, step)
@@ -61,11 +58,11 @@ class BorderSearch:
         return borders
 
     def shift(self, c_rr: float) -> None:
-        """Note that all steps are to show so much more."""
+        """Shift the c_rr of all histories."""
         self._rows[[LEAD, TRAIL]] += c_rr
 
     def _turn(self, regressor: float) -> None:
-        """Back across a border that only one axle had crossed, nobody knows on which ground the axles stand."""
+        """After a reversal on a border, the axles' ground is unknown."""
         direction = math.copysign(1.0, regressor)
         if direction == -self._direction:
             rows = self._rows
@@ -75,7 +72,7 @@ class BorderSearch:
         self._direction = direction
 
     def _branch(self, number: int, step: BalanceStep) -> None:
-        """One history more, with a border before this step: that of the likeliest whose axles stand on one ground."""
+        """Add a history with a border before this step to the likeliest on one ground."""
         rows = self._rows
         scores = np.where(rows[BEHIND_M] <= 0, rows[SCORE], -np.inf)
         parent = int(scores.argmax())
@@ -83,8 +80,8 @@ class BorderSearch:
             return
         level, variance = rows[LEAD, parent], rows[LEAD_VAR, parent]
         expected = self._tuning.borders_per_m * step.distance_m
-        odds = expected + math.log(-math.expm1(-expected))  # logarithm: one or more of a Poisson process, against none
-        behind_m = step.wheelbase_m + step.distance_m / 2  # a step shows the ground at its middle
+        odds = expected + math.log(-math.expm1(-expected))  # log-odds of a Poisson process: one or more against none
+        behind_m = step.wheelbase_m + step.distance_m / 2
         new = [level, level, self._tuning.unknown_std**2, 0.0, variance, scores[parent] + odds, behind_m]
         self._rows = np.column_stack([rows, new])
         recent = (border for border in self._borders[parent] if border > number - self._remembered)
@@ -94,7 +91,7 @@ class BorderSearch:
         """Condition all histories on the step, and score them."""
         rows, lead = self._rows, step.regressor * step.lead_share
         trail = step.regressor - lead
-        with_lead = lead * rows[LEAD_VAR] + trail * rows[COVARIANCE]  # covariances with what is measured
+        with_lead = lead * rows[LEAD_VAR] + trail * rows[COVARIANCE]  # covariances with the measurement
         with_trail = lead * rows[COVARIANCE] + trail * rows[TRAIL_VAR]
         variance = lead * with_lead + trail * with_trail + self._tuning.coloured * r
         innovation = raw - lead * rows[LEAD] - trail * rows[TRAIL]

@@ -1,13 +1,11 @@
-"""Calibration of the force balance while the machine works: the accelerometer's zero and the scale of the drive force.
+"""Calibration of the force balance at work: accelerometer bias and scale of the drive force.
 
-Over the same ground, forwards and in reverse, c_rr changes its sign in the balance and the errors do not. Half the sum
-of both passages is
+Forwards and in reverse over the same ground, c_rr changes sign in the balance; errors do not:
 
-    (unbalanced_1 + unbalanced_2) / 2 = zero + scale (share_1 + share_2) / 2
+    (unbalanced_1 + unbalanced_2) / 2 = bias + scale (share_1 + share_2) / 2
 
-so flat ground shows the zero and slopes the scale. Loaders drive so all day. Where the site names an area of known
-resistance, one passage is enough. Closed tours show the zero in one direction (`closed_tours`). All enter a Kalman
-filter over zero and scale error; a measurement that is far off, as at the border of a zone, is excluded.
+Flat ground shows the bias, slopes the scale. On ground of known resistance one passage is enough; closed loops show the
+bias (`closed_tours`). A Kalman filter combines them; outliers, as at a zone's border, are excluded.
 """
 
 import math
@@ -25,17 +23,16 @@ from protocol.arrays import Floats
 from protocol.machine.samples import APPLIED, LIMITS, SCALE_STD, ZERO_STD, ZERO_WALK
 from protocol.wire.messages import CalibrationOffer
 
-KEPT = 400  # stretches: 200 m of distance
-MOST_ZERO, MOST_SCALE = (LIMITS[name][1] for name in APPLIED)  # that a sample may state as applied
-EDGE_M = 3.0  # a machine is on known ground so far inside, and twice the standard deviation of its position
+KEPT = 400  # stretches: 200 m
+MOST_ZERO, MOST_SCALE = (LIMITS[name][1] for name in APPLIED)  # largest that a sample may state
+EDGE_M = 3.0  # distance inside known ground, plus two standard deviations
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Zero and scale error of the balance [-] with covariance (2, 2); stamp_ns: of the newest reading behind it, or 0.
+    """Bias and scale error [-] with covariance (2, 2); stamp_ns: newest reading used, or 0.
 
-    passages: how many pairs, known stretches and tours it comes from. offer_ns: stamp of the last offer of the map
-    server that is in it, or 0.
+    passages: pairs, known stretches and loops used. offer_ns: stamp of the last offer used, or 0.
     """
 
     zero: float
@@ -46,12 +43,12 @@ class Calibration:
     offer_ns: int = 0
 
     def variance(self, share: float) -> float:
-        """Variance that it leaves in a balance with this drive force over weight."""
+        """Variance it leaves in a balance of this share."""
         (zz, zs), (_, ss) = self.covariance
         return zz + 2 * share * zs + share**2 * ss
 
     def corrected(self, balance: Balance) -> float:
-        """The balance without its errors."""
+        """The calibrated balance."""
         return balance.unbalanced - self.zero - self.scale * balance.share
 
 
@@ -60,7 +57,7 @@ UNCALIBRATED = Calibration(0.0, 0.0, ((ZERO_STD**2, 0.0), (0.0, SCALE_STD**2)))
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Means over a stretch, in the frame of dead reckoning."""
+    """Means, in the frame of dead reckoning."""
 
     stamp_ns: int
     x_m: float
@@ -72,10 +69,10 @@ class _Stretch:
 
 
 class Calibrator:
-    """Matches stretches to pairs, and improves a calibration by them."""
+    """Pairs stretches, and improves a calibration by them."""
 
     def __init__(self, calibration: Calibration | None = None, tuning: EstimationTuning = TUNING) -> None:
-        """calibration: from before."""
+        """Start, perhaps with an earlier `calibration`."""
         start, self._tuning = calibration or UNCALIBRATED, tuning
         self.counters: Counter[str] = Counter()
         self._x = np.array([start.zero, start.scale])
@@ -83,28 +80,25 @@ class Calibrator:
         self._stamp_ns, self._passages = start.stamp_ns, start.passages
         self._aged_ns, self._offer_ns = start.stamp_ns, start.offer_ns
         self._past: deque[_Stretch] = deque(maxlen=KEPT)
-        self._stretch: list[Balance] = []  # of the present stretch
-        # innovations of tours, and of all else, since the last that passed the gate
+        self._stretch: list[Balance] = []
+        # innovations of loops and others since the last accepted one
         self._excluded: dict[bool, list[float]] = {True: [], False: []}
 
     @property
     def calibration(self) -> Calibration:
-        """The present one."""
+        """The current one."""
         (zz, zs), (_, ss) = self._P.tolist()
         zz, ss = (
             max(zz, self._tuning.floor**2),
             max(ss, (10 * self._tuning.floor) ** 2),
-        )  # raised variances keep a covariance definite
+        )  # keep it definite
         zero, scale = np.clip(self._x, (-MOST_ZERO, -MOST_SCALE), (MOST_ZERO, MOST_SCALE)).tolist()
         return Calibration(zero, scale, ((zz, zs), (zs, ss)), self._stamp_ns, self._passages, self._offer_ns)
 
     def update(
         self, balance: Balance, dead_reckoning: DeadReckoning, known_c_rr: float | None, shaking_var: float = 0.0
     ) -> None:
-        """Add a usable balance.
-
-        known_c_rr: of the ground here, where the site states it. shaking_var: of one balance, beyond the usual [-].
-        """
+        """Add a usable balance. known_c_rr: of the ground here; shaking_var: of one balance, beyond the usual [-]."""
         newest = self._stretch[-1] if self._stretch else balance
         if newest.direction != balance.direction or balance.stamp_ns - newest.stamp_ns > MAX_GAP_NS:
             self._stretch.clear()
@@ -113,7 +107,7 @@ class Calibrator:
             return
         variance = (
             self._tuning.stretch_std**2 + shaking_var / len(self._stretch) ** 2
-        )  # a body that shakes goes nowhere
+        )  # a shaking body goes nowhere
         stretch = self._end_stretch(dead_reckoning)
         if known_c_rr is not None:
             cosine = math.cos(balance.slope_x)
@@ -129,12 +123,12 @@ class Calibrator:
         self._past.append(stretch)
 
     def add_tour(self, tour: Tour) -> None:
-        """Add a closed tour."""
+        """Add a closed loop."""
         self._learn(tour.stamp_ns, tour.zero, 0.0, tour.std**2, is_tour=True)
         self.counters["tours"] += 1
 
     def take(self, offer: CalibrationOffer, now_ns: int) -> None:
-        """Take an offer of the map server, no surer than what is measured here, unless it contradicts that."""
+        """Fuse an offer that does not contradict the own estimate; both have the same variance floor."""
         self.age(now_ns)
         passed_s = max(now_ns - offer.stamp_ns, 0) * 1e-9
         offered: Floats = np.array([offer.zero, offer.scale])
@@ -151,7 +145,7 @@ class Calibrator:
         self.counters["offers"] += 1
 
     def age(self, stamp_ns: int) -> None:
-        """Let the zero drift until a stamp; it is never less sure than at first."""
+        """Let the bias drift, up to its initial variance."""
         if self._aged_ns:
             passed_s = max(stamp_ns - self._aged_ns, 0) * 1e-9
             aged = self._P[0, 0] + ZERO_WALK**2 * passed_s
@@ -159,20 +153,20 @@ class Calibrator:
         self._aged_ns = max(stamp_ns, self._aged_ns)
 
     def interrupt(self) -> None:
-        """The stretch under way is not usable."""
+        """Drop the current stretch."""
         self._stretch.clear()
 
     def _end_stretch(self, dead_reckoning: DeadReckoning) -> _Stretch:
         pose, n = dead_reckoning.pose, len(self._stretch)
         newest = self._stretch[-1]
-        half = newest.direction * 0.5 * self._tuning.stretch_m  # the middle of it lies behind
+        half = newest.direction * 0.5 * self._tuning.stretch_m
         x, y = pose.x_m - half * math.cos(pose.angle_rad), pose.y_m - half * math.sin(pose.angle_rad)
         unbalanced, share = (sum(getattr(b, name) for b in self._stretch) / n for name in ("unbalanced", "share"))
         self._stretch = [newest]
         return _Stretch(newest.stamp_ns, x, y, pose.angle_rad, newest.direction, unbalanced, share)
 
     def _partner(self, stretch: _Stretch) -> _Stretch | None:
-        """The nearest stretch of the other direction over the same ground."""
+        """Nearest stretch in the other direction."""
         partner, nearest_m = None, self._tuning.pair_m
         for other in reversed(self._past):
             if (stretch.stamp_ns - other.stamp_ns) * 1e-9 > self._tuning.pair_s:
@@ -187,7 +181,7 @@ class Calibrator:
         return partner
 
     def _learn(self, stamp_ns: int, measured: float, share: float, variance: float, *, is_tour: bool = False) -> None:
-        """Filter measured = zero + scale * share + noise."""
+        """Filter measured = bias + scale * share + noise."""
         self.age(stamp_ns)
         h: Floats = np.array([1.0, share])
         Ph = self._P @ h

@@ -1,4 +1,4 @@
-"""The calibration of a machine on disk, so that a restart does not forget it."""
+"""A machine's calibration on disk, across restarts."""
 
 import json
 import math
@@ -15,15 +15,15 @@ VERSION = 3
 
 
 class CalibrationFile:
-    """Where an agent keeps its calibration; no path: nowhere. problem: why it could not be read or written, or ""."""
+    """An agent's calibration; without a path it is not kept. problem: last read or write error, or ""."""
 
     def __init__(self, path: Path | None, machine: str) -> None:
         self.problem = ""
         self._path, self._machine = path, machine
-        self._saved_ns = 0  # stamp of the calibration in the file
+        self._saved_ns = 0
 
     def read(self) -> Calibration | None:
-        """The calibration from before; one that cannot be read is a problem, and the agent calibrates anew."""
+        """The stored calibration; an unreadable one is a problem, and the agent starts uncalibrated."""
         try:
             calibration = load(self._path, self._machine) if self._path else None
         except StoreError as error:
@@ -33,7 +33,7 @@ class CalibrationFile:
         return calibration
 
     def write(self, calibration: Calibration) -> None:
-        """Save a calibration that is newer than the file; a full disk must not stop the machine."""
+        """Save a newer calibration; a full disk must not stop the machine."""
         if not self._path or calibration.stamp_ns <= self._saved_ns:
             return
         try:
@@ -45,7 +45,7 @@ class CalibrationFile:
 
 
 def save(path: Path, machine: str, calibration: Calibration) -> None:
-    """Write whole or not at all; raises StoreError."""
+    """Write atomically; StoreError."""
     table = {"version": VERSION, "machine": machine, **asdict(calibration)}
     text = json.dumps({**table, "crc32": _checksum(table)}, indent=1)
     try:
@@ -55,7 +55,7 @@ def save(path: Path, machine: str, calibration: Calibration) -> None:
 
 
 def load(path: Path, machine: str) -> Calibration | None:
-    """Read what `save` wrote; None where there is no file. Raises StoreError on anything else than a calibration."""
+    """Read what `save` wrote; None without a file. StoreError if it is no calibration."""
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -72,7 +72,6 @@ def load(path: Path, machine: str) -> Calibration | None:
 
 
 def _checksum(table: dict[str, Any]) -> int:
-    """CRC-32 of all values and their names."""
     return zlib.crc32(json.dumps(table, sort_keys=True).encode())
 
 

@@ -1,17 +1,15 @@
-"""Closed tours: who is back where he was has risen by nothing, which shows the accelerometer's zero in one direction.
+"""Closed loops: a machine that returns to its starting point has climbed nothing, which shows the bias ahead.
 
-    sum of (slope as measured) * distance  =  - zero * sum of distance          distances count down in reverse
+    sum of (slope as measured) * distance  =  - bias * sum of distance          distances count down in reverse
 
-over any closed tour, with or without slopes. Slopes are those of the accelerometer alone, less the wheels'
-acceleration: a filter's would lag behind the ramps, and what that acceleration is wrong by is gone when the speed is
-what it was (acceleration summed over distance is half the change of the speed's square). A jolt is the exception, as at
-the foot of a ramp or where wheels spin on sand: for this moment the accelerometer is at its end, or the wheels'
-acceleration is none of the machine's, and the filter's slope, by the gyros, is the better one. Distances are those of
-positions: they are level, and wheels slip uphill.
+The slope is the accelerometer's, less wheel acceleration: a filter's would lag behind ramps, and errors of that
+acceleration cancel once the speed returns (acceleration over distance is half the change of squared speed). During a
+shock, at the foot of a ramp or in wheel spin, accelerometer or wheels are wrong; then the filter's slope, by gyros, is
+better. Distances are those of positions: they are level, and wheels slip uphill.
 
-The machine leaves a mark in each cell that it passes. In a cell with a mark a tour is closed; then the marks of the
-tour go, and the machine goes on from the old one. So every metre counts in one tour only, a tour inside of another one
-too (the loop erasure of Lawler 1980), and what tours show is independent.
+The machine marks each cell that it passes. A marked cell closes a loop: the loop's marks go, and the track continues
+from the old mark. So each metre counts in one loop, nested ones included (loop erasure, Lawler 1980), and loops are
+independent.
 """
 
 import math
@@ -21,20 +19,20 @@ from agents.estimation.attitude import MAX_SINE
 from agents.estimation.balance import MAX_GAP_NS, Balance
 from agents.localisation.filters.belief import PoseBelief
 
-STEP_M = 2.0  # of wheel travel; of shorter ones the noise of positions would be a part
+STEP_M = 2.0  # wheel travel per step; shorter ones would add noise of positions
 CELL_M = 2.0
-LEAST_M = 60.0  # a shorter tour shows less than the data sheet
-JUMP_M = 1.0  # of a position against the wheels' travel, beside half of it: it was not driven, or wheels spun
-MAX_JOLT_S = 2.0  # one that lasts longer is a broken accelerometer, or a machine that digs in
-MOST_STD_M = 3.0  # a less sure position is no place to come back to
+LEAST_M = 60.0  # shorter loops show less than the data sheet
+JUMP_M = 1.0  # mismatch of position and wheel travel, beside half the travel: not driven, or wheels spun
+MAX_JOLT_S = 2.0  # a longer one is a broken accelerometer, or digging
+MOST_STD_M = 3.0  # standard deviation beyond which a position closes no loop
 KEPT = 5000  # marks: 10 km, an hour on a haul road
-# Standard deviation of the rise of a tour: of unevenness where it closes, and per root of a metre driven.
+# Standard deviation of a loop's rise: unevenness where it closes, and per square root of a metre.
 CLOSING_M, RISE_NOISE = 0.15, 0.013
 
 
 @dataclass(frozen=True)
 class Tour:
-    """A closed tour: the zero of the balance [-] by it, with its standard deviation; distance_m: ahead less reverse."""
+    """A closed loop: bias of the balance [-] and its standard deviation; distance_m: ahead less reverse."""
 
     stamp_ns: int
     zero: float
@@ -44,10 +42,7 @@ class Tour:
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """Sums up to a place, with the variance of the position [m2], the larger one of both axes.
-
-    rise_m: as measured. net_m: driven ahead less in reverse. driven_m: both.
-    """
+    """Sums up to a place: rise_m as measured, net_m ahead less reverse, driven_m both; the larger position variance."""
 
     rise_m: float = 0.0
     net_m: float = 0.0
@@ -56,21 +51,21 @@ class _Mark:
 
 
 class ClosedTours:
-    """Watches one machine. torn: how often the track could not be followed, and began anew."""
+    """Watches one machine. torn: how often the track was interrupted."""
 
     def __init__(self) -> None:
         self.torn = 0
-        self._marks: dict[tuple[int, int], _Mark] = {}  # by cell, in the order of the track
+        self._marks: dict[tuple[int, int], _Mark] = {}  # by cell, in track order
         self._sums = _Mark()
         self._last: Balance | None = None
         self._jolted_s = 0.0
         self._place_m = (0.0, 0.0)  # at the end of the last step
-        self._step = (0.0, 0.0, 0.0)  # under way, by the wheels: rise, travel, distance
+        self._step = (0.0, 0.0, 0.0)  # current step by the wheels: rise, travel, distance
 
     def update(self, balance: Balance, pose: PoseBelief | None, *, is_jolted: bool = False) -> Tour | None:
-        """Add a balance at a pose; returns the tour that it closes. Without a pose there is no track to follow.
+        """Add a balance at a pose (None interrupts the track); returns the loop it closes.
 
-        is_jolted: whether forces act that are no slope, or the wheels slip.
+        is_jolted: whether a shock acts, or wheels slip.
         """
         last, self._last = self._last, balance
         self._jolted_s = self._jolted_s + balance.dt_s if is_jolted else 0.0
@@ -86,11 +81,10 @@ class ClosedTours:
         return self._end_step(balance, pose) if abs(self._step[1]) >= STEP_M else None
 
     def interrupt(self) -> None:
-        """What follows cannot be joined to what was before."""
+        """Separate what follows from what came before."""
         self._last = None
 
     def _begin(self, pose: PoseBelief | None) -> None:
-        """Forget the track, and begin anew here."""
         self.torn += bool(self._marks)
         self._marks.clear()
         self._sums, self._step = _Mark(), (0.0, 0.0, 0.0)
@@ -114,7 +108,7 @@ class ClosedTours:
         return self._pass_cell(balance, pose) if variance_m2 < MOST_STD_M**2 else None
 
     def _pass_cell(self, balance: Balance, pose: PoseBelief) -> Tour | None:
-        """Leave a mark in this cell, or close a tour if there is one."""
+        """Mark this cell, or close a loop at its mark."""
         cell, sums = (math.floor(pose.x_m / CELL_M), math.floor(pose.y_m / CELL_M)), self._sums
         mark = self._marks.setdefault(cell, sums)
         if len(self._marks) > KEPT:
@@ -129,14 +123,14 @@ class ClosedTours:
 
 
 def _tour(balance: Balance, start: _Mark, end: _Mark) -> Tour | None:
-    """What a tour from a mark back to its cell shows; None where it is too short, or would close on a steep slope.
+    """The loop from a mark back to its cell; None if too short, or closed on a steep slope.
 
-    There the two places in the cell may differ by more height than all else; a cell after the slope serves as well.
+    There, heights within the cell differ too much; a later cell off the slope serves as well.
     """
     net_m, driven_m = end.net_m - start.net_m, end.driven_m - start.driven_m
     if abs(net_m) < LEAST_M:
         return None
-    apart_m2 = CELL_M**2 / 6 + start.variance_m2 + end.variance_m2  # of two places in one cell, along an axis
+    apart_m2 = CELL_M**2 / 6 + start.variance_m2 + end.variance_m2  # between two places in one cell, along an axis
     slope = math.hypot(math.tan(balance.slope_x), math.tan(balance.slope_y))
     by_slope_m2, by_distance_m2 = apart_m2 * slope**2, CLOSING_M**2 + RISE_NOISE**2 * driven_m
     if by_slope_m2 > by_distance_m2:

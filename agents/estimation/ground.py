@@ -1,8 +1,7 @@
-"""Rolling resistance and slope of the ground under one machine, with the calibration that it finds at work.
+"""Rolling resistance and slope under one machine, with its calibration at work.
 
-Readings become balances of force (`balance`); those that show nothing of the ground are excluded with a reason
-(`plausibility`); an estimator follows c_rr over the others (`resistance_kalman`, `resistance_rls`). The estimate of a
-stamp is asked for a little later, so that the steps after it help.
+Readings become force balances (`balance`); unusable ones are excluded with a reason (`plausibility`); an estimator
+tracks c_rr (`resistance_kalman`, `resistance_rls`). Estimates are read late, so that later steps help.
 """
 
 import math
@@ -30,20 +29,20 @@ from protocol.machine.samples import ZERO_STD
 ESTIMATORS = ("kalman", "rls")
 MASSES = ("message", "known", "estimated")
 KEPT = 400  # steps: 20 s
-NEAR_NS = 200_000_000  # a stamp this far from a step has no slope
-SILENT_NS = 1_000_000_000  # other sensors have readings, but no step was made for so long
-JOLTS = frozenset({"accelerometer", "slip"})  # then the accelerometer does not show the slope ahead
-MAX_LOADED = 4.0  # loaded mass over empty mass; forces that say more are no mass
+NEAR_NS = 200_000_000  # greatest distance of a stamp from a step
+SILENT_NS = 1_000_000_000  # time without a step, though other sensors report, that is a fault
+JOLTS = frozenset({"accelerometer", "slip"})  # the accelerometer does not show the slope ahead
+MAX_LOADED = 4.0  # upper bound of loaded over empty mass
 
 
 @dataclass(frozen=True)
 class EstimationConfig:
     """How the ground is estimated.
 
-    estimator: "kalman", or "rls" (least squares with multiple forgetting, as the paper has it). mass: "message" (the
-    machine's, and what payload readings add), "known" (the machine's alone) or "estimated" (from forces). calibrate:
-    whether zero and scale of the force balance are found at work; closed_tours: by closed tours too, which takes a site
-    on which no track passes over another one. accept_calibration: whether what the map server offers counts as well.
+    estimator: "kalman", or "rls" (least squares with multiple forgetting, as in the paper). mass: "message" (machine
+    plus payload readings), "known" (machine) or "estimated" (by forces). calibrate: whether to estimate bias and scale
+    at work. closed_tours: also by closed loops; no track may pass over another. accept_calibration: whether the map
+    server's offers count.
     """
 
     estimator: str = "kalman"
@@ -66,9 +65,8 @@ class EstimationConfig:
 class GroundEstimate:
     """The ground at a stamp.
 
-    c_rr, c_rr_var: NaN where `reason` states why c_rr is not known, "" else. slope_x, slope_y: rise over run ahead and
-    to the left, slope_var of either; NaN where the slope is not known. zero, scale: of the calibration that is applied
-    in it. mass_kg: of machine and payload, NaN where it is not known.
+    c_rr, c_rr_var: NaN if unknown; `reason` says why, else "". slope_x, slope_y, slope_var: rise over run ahead and
+    left; NaN if unknown. zero, scale: applied calibration. mass_kg: with payload, NaN if unknown.
     """
 
     c_rr: float
@@ -87,7 +85,7 @@ NOTHING_KNOWN = GroundEstimate(math.nan, math.nan, math.nan, math.nan, math.nan,
 
 @dataclass(frozen=True, slots=True)
 class _JudgedBalance:
-    """A balance as it was judged, and the slope ahead by the estimator in use [rad]."""
+    """A judged balance; slope_x of the estimator in use [rad]."""
 
     stamp_ns: int
     balance: Balance
@@ -96,7 +94,7 @@ class _JudgedBalance:
 
 
 class GroundEstimator:
-    """Estimator of one machine; `update` expects readings in the order of their stamps."""
+    """Estimator of one machine; readings in stamp order."""
 
     def __init__(
         self,
@@ -105,7 +103,7 @@ class GroundEstimator:
         calibration: Calibration | None = None,
         tuning: EstimationTuning = TUNING,
     ) -> None:
-        """calibration: from before."""
+        """Start, with the `calibration` of an earlier run."""
         self._machine, self._config, self._tuning = machine, config, tuning
         self._balancer = Balancer(machine, weighs=config.mass == "message")
         self._plausibility = Plausibility(machine.wheelbase_m)
@@ -123,7 +121,7 @@ class GroundEstimator:
         )
         self._grade = RecursiveGrade() if config.estimator == "rls" else None
         self._judged: deque[_JudgedBalance] = deque(maxlen=KEPT)
-        self._usable_m = 0.0  # distance at the last usable balance
+        self._usable_m = 0.0
         self._stands_s = 0.0
         self._newest_reading_ns = 0  # of any sensor
 
@@ -134,7 +132,7 @@ class GroundEstimator:
 
     @property
     def fault(self) -> str:
-        """The sensor fault that keeps resistance from being known now, "" if none does."""
+        """Sensor fault that hides the resistance, or ""."""
         if self._newest_reading_ns - self.newest_ns > SILENT_NS:
             return NOTHING_KNOWN.reason
         reason = self._judged[-1].reason if self._judged else ""
@@ -142,23 +140,20 @@ class GroundEstimator:
 
     @property
     def estimated_mass_kg(self) -> float | None:
-        """Mass with payload, by forces; None where the configuration does not ask for it.
-
-        A scale error s of drive force over mass means a true mass of m / (1 - s).
-        """
+        """Mass with payload by forces, m / (1 - scale error); None if not configured."""
         if self._config.mass != "estimated":
             return None
         return self._machine.mass_kg / max(1 - self._resistance.scale, 1 / MAX_LOADED)
 
     @property
     def traction(self) -> float | None:
-        """Drive force over weight by engine or motor, which dead reckoning cannot know; None where nobody does."""
+        """Drive force over weight by engine or motor, else None."""
         newest = self._judged[-1].balance if self._judged and self._balancer.is_before_wheels else None
         return newest.share if newest and not newest.unknown else None
 
     @property
     def calibration(self) -> Calibration:
-        """Zero and scale by the work so far."""
+        """Bias and scale so far."""
         return self._calibrator.calibration
 
     def health(self) -> dict[str, Any]:
@@ -193,7 +188,7 @@ class GroundEstimator:
         known_c_rr: float | None = None,
         pose: PoseBelief | None = None,
     ) -> None:
-        """Add a reading, after dead reckoning did. known_c_rr: of the ground here, where the site states it."""
+        """Add a reading, after dead reckoning. known_c_rr: of the ground here, if the site states it."""
         self._newest_reading_ns = max(self._newest_reading_ns, reading.stamp_ns)
         self._skid_steering.update(reading, sensor, dead_reckoning)
         if balance := self._balancer.update(reading, sensor, dead_reckoning):
@@ -202,12 +197,12 @@ class GroundEstimator:
                 self._follow(balance, pose)
 
     def consider(self, offer: Any) -> None:
-        """Judge what the map server offers, as it came; a good one counts when the calibration changes next."""
+        """Judge an unvalidated offer; a good one counts at the next calibration change."""
         if self._config.accept_calibration:
             self._offers.consider(offer, self._newest_reading_ns)
 
     def at(self, stamp_ns: int) -> GroundEstimate:
-        """The estimate for a recent stamp, with the steps after it."""
+        """Estimate at a recent stamp, using later steps."""
         judged = self._nearest(stamp_ns)
         if judged is None:
             return replace(NOTHING_KNOWN, mass_kg=self._known_mass(self._balancer.mass_kg))
@@ -221,15 +216,15 @@ class GroundEstimator:
             c_rr = resistance[0]
             variance = resistance[1] + applied.variance(balance.share) / cosine**2 + self._tuning.model_std**2
         reason = judged.reason or ("" if resistance else "settling")
-        slope_x = math.tan(judged.slope_x + applied.zero)  # the accelerometer's zero is an error of the slope too
-        # The mean of both directions: work shows the zero ahead; across, nothing shows how the sensor is mounted.
+        slope_x = math.tan(judged.slope_x + applied.zero)  # the accelerometer's bias is an error of the slope too
+        # Mean of both directions: nothing shows the bias across.
         slope_var = balance.slope_var + (applied.covariance[0][0] + ZERO_STD**2) / 2
         slope_y, calibration = math.tan(balance.slope_y), (applied.zero, applied.scale)
         mass_kg = self._known_mass(balance.mass_kg)
         return GroundEstimate(c_rr, variance, slope_x, slope_y, slope_var, reason, *calibration, mass_kg)
 
     def _known_mass(self, mass_kg: float) -> float:
-        """The mass as weighed; where it is to be estimated, that is a ratio of forces, and not kilograms."""
+        """The weighed mass, if it is not estimated."""
         return math.nan if self._config.mass == "estimated" else mass_kg
 
     def _nearest(self, stamp_ns: int) -> _JudgedBalance | None:
@@ -262,9 +257,9 @@ class GroundEstimator:
             self._calibrator.update(balance, dead_reckoning, known_c_rr, shaking_var)
 
     def _follow(self, balance: Balance, pose: PoseBelief | None) -> None:
-        """Follow the track; what a tour shows takes effect at once, since a machine on tours may never stand."""
+        """Follow the track; a loop takes effect at once, since a machine on loops may never stand."""
         reason = self._judged[-1].reason
-        if reason == "no_wheels":  # then nobody knows how far it was
+        if reason == "no_wheels":  # distance unknown
             self._tours.interrupt()
         elif tour := self._tours.update(balance, pose, is_jolted=reason in JOLTS):
             self._calibrator.add_tour(tour)
@@ -281,7 +276,7 @@ class GroundEstimator:
         return replace(step, share_var=balance.share_var) if balance.share_var else step
 
     def _stand(self, balance: Balance) -> None:
-        """What stretches show takes effect while the machine stands: it comes in small steps, each half a metre."""
+        """Apply the calibration at standstill; passages change it in small steps."""
         self._stands_s += balance.dt_s
         self._apply_calibration(balance.stamp_ns)
         self._resistance.stand(changes_load=self._stands_s > LOADING_S)
@@ -294,5 +289,5 @@ class GroundEstimator:
             before, self._applied = self._applied, self._calibrator.calibration
             zero, scale = self._applied.zero - before.zero, self._applied.scale - before.scale
             if zero or scale:
-                self._longer.clear()  # what waits there has the old one
+                self._longer.clear()  # still with the old calibration
                 self._resistance.recalibrate(zero, scale)

@@ -1,11 +1,11 @@
-"""What the map server offers for a calibration: one estimate more, and never the truth.
+"""Calibration offers of the map server: one more estimate, never the truth.
 
-It is made of samples of this machine, and so of the readings that the machine's own estimate is made of. How far the
-two depend on each other nobody knows. Covariance intersection (Julier and Uhlmann 1997) is consistent whatever that is:
+An offer comes from this machine's samples, so it depends on the same readings as the own estimate, to an unknown
+degree. Covariance intersection (Julier and Uhlmann 1997) is consistent in any case, and an offer repeated adds nothing:
 
     P^-1 = w A^-1 + (1 - w) B^-1        P^-1 x = w A^-1 a + (1 - w) B^-1 b
 
-with the weight w in 0 to 1 for which det P is least. So what is offered twice shows nothing new.
+with w in 0 to 1 that minimises det P.
 """
 
 from collections import Counter
@@ -19,25 +19,22 @@ from protocol.units import HOUR_NS
 from protocol.wire.codec import decode_offer
 from protocol.wire.messages import CalibrationOffer
 
-TOO_OLD_NS = HOUR_NS  # by then a zero has moved by as much as it is unsure at first
-AHEAD_NS = 600 * 10**9  # of the machine's clock: others may be ahead of it, but not by more than the server decides in
+TOO_OLD_NS = HOUR_NS  # by then a bias has drifted by its initial deviation
+AHEAD_NS = 600 * 10**9  # largest lead over the machine's clock, longer than the server's decision interval
 WEIGHTS = np.linspace(0.0, 1.0, 101)
 
 
 class Offers:
-    """Judges what is offered to one machine. counters: what was refused, by reason.
-
-    The newest good offer waits until the machine is ready for it.
-    """
+    """Judges offers to one machine; the newest good one waits. counters: refusals by reason."""
 
     def __init__(self, machine: str, newest_ns: int) -> None:
-        """newest_ns: stamp of the last offer that was taken before, 0 for none."""
+        """newest_ns: stamp of the last offer taken, or 0."""
         self.counters: Counter[str] = Counter()
         self._machine, self._newest_ns = machine, newest_ns
         self._waiting: CalibrationOffer | None = None
 
     def consider(self, table: Any, now_ns: int) -> None:
-        """Judge an offer as it came. now_ns: the machine's."""
+        """Judge an undecoded offer; now_ns: the machine's."""
         try:
             offer = decode_offer(table)
         except MessageError as error:
@@ -45,16 +42,16 @@ class Offers:
             return
         if problem := self._problem(offer, now_ns):
             self.counters[f"refused_offer_{problem}"] += 1
-        elif offer.stamp_ns > self._newest_ns:  # else it is the last one: it comes with each acknowledgement
+        elif offer.stamp_ns > self._newest_ns:  # else a repetition: it comes with each acknowledgement
             self._newest_ns, self._waiting = offer.stamp_ns, offer
 
     def take(self) -> CalibrationOffer | None:
-        """The offer that waits, once."""
+        """The waiting offer, once."""
         offer, self._waiting = self._waiting, None
         return offer
 
     def _problem(self, offer: CalibrationOffer, now_ns: int) -> str:
-        """Why it is not for this machine now, "" if it is."""
+        """Why it does not count now, or ""."""
         if offer.machine != self._machine:
             return "wrong_machine"
         if offer.stamp_ns < self._newest_ns:
@@ -65,7 +62,7 @@ class Offers:
 
 
 def intersected(a: Floats, A: Floats, b: Floats, B: Floats) -> tuple[Floats, Floats]:
-    """Mean (n,) and covariance (n, n) of two estimates that may depend on each other in any way."""
+    """Mean (n,) and covariance (n, n) of two estimates of unknown correlation."""
     of_a, of_b = np.linalg.inv(A), np.linalg.inv(B)
     information = WEIGHTS[:, None, None] * of_a + (1 - WEIGHTS[:, None, None]) * of_b
     best = int(np.argmax(np.linalg.det(information)))

@@ -1,12 +1,11 @@
-"""Whether a balance may be believed; if not, the reason in a word that health and counters carry.
+"""Whether a force balance is usable; if not, a one-word reason for health and counters.
 
-A machine that stands, brakes, digs, spins its wheels or slips in its driveline shows nothing of the ground's
-resistance; on a change of slope its axles stand on two slopes; and sensors fail: they fall silent, freeze (stuck, or at
-the end of their range), or come in the wrong unit.
+A machine that stands, brakes, digs, or slips in wheels or driveline shows nothing of the ground's resistance. At a
+change of slope its axles stand on two slopes. Sensors fall silent, freeze, saturate, or use a wrong unit.
 
-Brakes that neither the torque sensor nor a reading shows make the ground seem rough: downhill at constant speed and
-without torque, c_rr would be just the grade. So a machine that rolls without torque on ground that seems rougher than
-where it pulled shows nothing, unless its brakes are read, or its torque has braked before: then that sees them.
+Unmeasured brakes look like rough ground: downhill at constant speed without torque, c_rr would equal the grade. So
+coasting on ground that seems rougher than while pulling counts as braking, unless brakes are read, or torque has been
+seen to brake.
 """
 
 import math
@@ -15,88 +14,86 @@ from agents.estimation.balance import SLOW_MPS, Balance
 from agents.estimation.shaking import Shaking
 from protocol.units import GRAVITY_MPS2
 
-# Reasons that make the slope worthless too: such a sample says that the machine was there, and how heavy.
+# Reasons that invalidate the slope too, leaving presence and mass.
 SLOPE_TOO = frozenset({"pitch_transient", "accelerometer"})
-# Reasons that are a fault of a sensor, not of the moment.
+# Reasons that are sensor faults.
 FAULTS = frozenset({"accelerometer", "no_torque", "no_wheels", "torque_frozen", "torque_implausible"})
-# Norm of a specific force in m/s2. One in g or in mm/s2 is outside, and so is a broken sensor.
+# Plausible norm of the specific force [m/s2]; neither g nor mm/s2.
 FORCE_NORMS_MPS2 = (5.0, 15.0)
-STALE_S = 0.5  # torque or wheel readings older than this are missing
-# Wheels certainly roll, and in this direction, if their speed is so many times its standard deviation: 0.15 m/s by an
-# encoder of 100 ticks on a wheel of 0.75 m, at 20 Hz. Slower than the second number they roll into the ground's play.
+STALE_S = 0.5  # age at which torque or wheel readings expire
+# Speed in standard deviations from which wheels roll in a known direction: 0.15 m/s with 100 ticks, a wheel of 0.75 m
+# and 20 Hz. Below the second number they may roll into a dip.
 ROLLS_SIGMA, MIN_SPEED_MPS = 3.0, 0.05
-# The pitch rate over the speed is the change of slope per metre. At the first limit the axles of a loader stand on
-# slopes that differ by the second, 2.5 degrees; a shorter machine may bend its way by more. Where a machine shakes, the
-# rate is the mean over the way from axle to axle.
+# Bounds of the slope's change per metre, pitch rate over speed, and between a loader's axles, 2.5 degrees; shorter
+# machines may curve more. A shaking machine's rate is averaged over a wheelbase.
 MAX_CURVE_RADPM, MAX_DIFFERENCE_RAD = 0.013, 0.0429
-# What a step may shake by, ahead and in pitch, before limits widen. A loader on tyres has 0.15 m/s2 and 0.002 rad/s,
-# 0.013 rad/s at the foot of a ramp. The second is half the rate that is too much.
+# Usual shaking per step, ahead and in pitch. A loader on tyres has 0.15 m/s2 and 0.002 rad/s, 0.013 rad/s at the foot
+# of a ramp. The second is half of what is too much.
 USUAL_MPS2, USUAL_RADPS = 0.25, 0.013
-AXLES_M = 3.3  # the way from axle to axle where the wheelbase is not known: a loader's
-AXLES_S = (0.5, 1.0)  # limits of the time that the way takes: a gyro's bias turns the slope of who creeps
-MAX_BRAKE_MPS2 = 1.5  # the wheels slow down faster than by any resistance but that of sand
-# Of drive force over weight, in the direction of travel: who pulls more does not brake, but sand or a ramp slows it
-# down. Above noise and zero of the torque of one that coasts, and no more than gravel resists.
+AXLES_M = 3.3  # assumed wheelbase where unknown: a loader's
+AXLES_S = (0.5, 1.0)  # bounds of the time to drive it; at creeping speed gyro bias would turn the slope
+MAX_BRAKE_MPS2 = 1.5  # faster deceleration than by any ground but sand
+# Drive force over weight beyond which a machine pulls, and sand or a ramp slows it, not brakes. Above noise and bias of
+# coasting torque, below what gravel resists.
 PULLS_SHARE = 0.02
-APPLIED = 0.01  # of a brake: less is its play
-# Drive force over weight in the direction of travel: below the first, the machine rolls without torque, but for noise
-# and zero; below the second the torque brakes it, as no engine's own drag does.
+APPLIED = 0.01  # applied share of a brake; less is play
+# Drive force over weight in the direction of travel. Below the first the machine coasts, but for noise and bias; below
+# the second, torque brakes beyond engine drag.
 ROLLS_SHARE, BRAKES_SHARE = 0.015, -0.06
-ROUGHER = 0.02  # c_rr as it rolls, above that of before: more than noise and zero make of it
-MAX_C_RR = 0.45  # no ground that a machine drives on resists more: the bucket digs
-MIN_C_RR = -0.08  # the ground pushes: the torque that does it is missing, and no accelerometer's zero is so far off
-MAX_SLIP_MPS2 = 1.0  # the wheels' acceleration is this far from the body's: they spin or lock
-MEAN_S = 0.3  # over which wheels and body are compared
-HOLD_S = 0.5  # forces settle for so long after slip, braking, digging and a turn of a machine that skids
-# Torque that stays exactly the same for so long, while the force that the motion takes changes by this share of the
-# weight, is stuck or at the end of its range.
+ROUGHER = 0.02  # c_rr while coasting above that while pulling, beyond noise and bias
+MAX_C_RR = 0.45  # upper bound of c_rr; beyond it, the bucket digs
+MIN_C_RR = -0.08  # lower bound of c_rr; below it torque is missing, as no bias is so large
+MAX_SLIP_MPS2 = 1.0  # wheel less body acceleration at which wheels spin or lock
+MEAN_S = 0.3  # time constant of that comparison
+HOLD_S = 0.5  # settling time after slip, brakes, digging, skid turns
+# Torque constant for so long, while the motion's force changes by this share of the weight, is frozen or saturated.
 FROZEN_S, FROZEN_SHARE = 2.0, 0.03
-MAX_SHARE = 1.2  # of drive force over weight: no tyre drives with much more than its load
-# Drive force per force that the motion takes: 1 if units are right; a scale error of sensors is far smaller.
+MAX_SHARE = 1.2  # upper bound of drive force over weight; tyres transmit little more than their load
+# Bounds of drive force over the motion's force; 1 with correct units.
 MIN_GAIN, MAX_GAIN = 0.4, 2.5
-PUSHES = -0.03  # c_rr by a balance that no zero of a sensor explains, nor a jolt: the ground seems to push
-SMOOTH_S = 1.0  # over which the two are smoothed before they are compared
-FORGET_S = 120.0  # how long their comparison is remembered
+PUSHES = -0.03  # c_rr of one balance beyond bias and shocks: the ground seems to push
+SMOOTH_S = 1.0  # smoothing before comparison
+FORGET_S = 120.0  # memory of the comparison
 LEAST_COMPARED_S = 20.0
-LEAST_VARIED = 0.3 / GRAVITY_MPS2  # standard deviation of the force that the motion takes, over weight
+LEAST_VARIED = 0.3 / GRAVITY_MPS2  # standard deviation of the motion's force over weight
 
 
 class Plausibility:
-    """Judges balances one after another. axles_m: the wheelbase, 0 where it is not known."""
+    """Judges successive balances. axles_m: the wheelbase, 0 if unknown."""
 
     def __init__(self, axles_m: float = 0.0) -> None:
         self._axles_m = axles_m or AXLES_M
         self._shaking, self._pitching = Shaking(USUAL_MPS2), Shaking(USUAL_RADPS)
-        self._norm_mps2 = GRAVITY_MPS2  # of the specific force, low-passed
-        self._pitch_radps = 0.0  # mean over the way from axle to axle
-        self._mismatch_mps2 = 0.0  # wheels against body, low-passed
-        self._hold = ("", 0.0)  # reason, and for how long still
+        self._norm_mps2 = GRAVITY_MPS2  # low-passed specific force
+        self._pitch_radps = 0.0  # mean over a wheelbase
+        self._mismatch_mps2 = 0.0  # low-passed acceleration of wheels less body
+        self._hold = ("", 0.0)  # reason, and its remaining time
         self._frozen = _Frozen()
         self._gain = _Gain()
-        self._resisted = 0.0  # resistance, low-passed
-        self._braked = 0.0  # drive force over weight in the direction of travel, low-passed
-        self._pulled = self._rolled = 0.0  # resistance as it pulled, and as it rolls without torque, low-passed
-        self._torque_brakes = False  # whether the torque was seen to brake
+        self._resisted = 0.0  # low-passed resistance
+        self._braked = 0.0  # low-passed drive force over weight in the direction of travel
+        self._pulled = self._rolled = 0.0  # low-passed resistance while pulling, and while coasting
+        self._torque_brakes = False
 
     @property
     def shaking_var(self) -> float:
-        """Variance of c_rr by one balance, from what the machine shakes beyond the usual [-]."""
+        """Variance of one balance's c_rr by unusual shaking [-]."""
         return self._shaking.variance / GRAVITY_MPS2**2
 
     def judge(self, balance: Balance, resistance: float, *, skids: bool = False) -> str:
-        """Why this balance shows nothing of the resistance; "" if it does.
+        """Why this balance shows nothing of the resistance, or "".
 
-        resistance: c_rr by this balance. skids: whether the wheels slide sideways in a turn.
+        resistance: c_rr of this balance. skids: whether wheels slide sideways in a turn.
         """
         self._follow(balance)
-        norm_mps2 = self._norm_mps2 if self._shaking.variance else balance.norm_mps2  # a jolt is no vibration
+        norm_mps2 = self._norm_mps2 if self._shaking.variance else balance.norm_mps2  # a single shock is no vibration
         if not FORCE_NORMS_MPS2[0] <= norm_mps2 <= FORCE_NORMS_MPS2[1]:
             return "accelerometer"
         if fault := self._fault(balance, resistance):
             return fault
         if not _rolls(balance):
             return "standstill"
-        if balance.unknown:  # engine and driveline settle for as long after it
+        if balance.unknown:  # engine and driveline settle as long afterwards
             self._hold = balance.unknown, HOLD_S
             return balance.unknown
         pitch_radps = self._pitch_radps if self._pitching.variance else balance.pitch_radps
@@ -106,7 +103,6 @@ class Plausibility:
         return self._unsteady(balance, resistance, skids=skids)
 
     def _follow(self, balance: Balance) -> None:
-        """Average what shakes."""
         self._norm_mps2 += min(balance.dt_s / MEAN_S, 1.0) * (balance.norm_mps2 - self._norm_mps2)
         low_s, high_s = AXLES_S
         way_s = max(low_s, min(high_s, self._axles_m / max(abs(balance.speed_mps), MIN_SPEED_MPS)))
@@ -120,11 +116,11 @@ class Plausibility:
         if balance.torque_s > STALE_S:
             return "no_torque"
         drives = _rolls(balance) and not balance.unknown
-        # Its top and its bottom shake; torque in steps stays the same within one, sqrt(12) standard deviations wide.
+        # Extremes shake; stepped torque is constant within a step, sqrt(12) standard deviations wide.
         steps = 2 * math.sqrt(12 * balance.share_var)
         frozen_share = FROZEN_SHARE + steps + 2 * self._shaking.margin(MEAN_S) / GRAVITY_MPS2
         is_frozen = self._frozen.update(balance, drives=drives) >= frozen_share and self._frozen.same_s >= FROZEN_S
-        if is_frozen and abs(balance.share) > ROLLS_SHARE:  # none at all is that of a machine that rolls or brakes
+        if is_frozen and abs(balance.share) > ROLLS_SHARE:  # zero torque is normal while coasting or braking
             return "torque_frozen"
         if abs(balance.share) > MAX_SHARE:
             return "torque_implausible"
@@ -135,7 +131,7 @@ class Plausibility:
         return "torque_implausible" if self._resisted < least or self._gain.is_wrong else ""
 
     def _unsteady(self, balance: Balance, resistance: float, *, skids: bool) -> str:
-        """Whether forces that the balance does not include act, or acted a moment ago."""
+        """Reason if unmodelled forces act, or acted within the hold time."""
         may_brake = self._may_brake_unseen(balance, resistance)
         difference = balance.accel_mps2 - balance.body_mps2
         self._mismatch_mps2 += min(balance.dt_s / MEAN_S, 1.0) * (difference - self._mismatch_mps2)
@@ -154,7 +150,7 @@ class Plausibility:
         return reason if left_s > 0 else ""
 
     def _may_brake_unseen(self, balance: Balance, resistance: float) -> bool:
-        """Whether the machine rolls without torque on ground that seems rougher, and nothing has shown its brakes."""
+        """Whether the machine coasts on seemingly rougher ground and its brakes are not observable."""
         pulls = balance.direction * balance.share
         if pulls > ROLLS_SHARE:
             self._pulled += min(balance.dt_s / SMOOTH_S, 1.0) * (resistance - self._pulled)
@@ -172,13 +168,13 @@ def _rolls(balance: Balance) -> bool:
 
 
 def _brakes(balance: Balance) -> bool:
-    """Whether a brake is applied, or the machine slows down fast, not because the ground does it while it pulls."""
+    """Whether a brake is applied, or the machine slows down too fast without pulling."""
     slows_mps2 = -balance.direction * balance.accel_mps2
     return balance.brake > APPLIED or (slows_mps2 > MAX_BRAKE_MPS2 and balance.direction * balance.share < PULLS_SHARE)
 
 
 class _Frozen:
-    """How long the drive force has been exactly the same, and how much the motion's force has changed meanwhile."""
+    """How long drive force has been constant, and how much the motion's force has changed meanwhile."""
 
     def __init__(self) -> None:
         self.same_s = 0.0
@@ -186,7 +182,7 @@ class _Frozen:
         self._motion = self._low = self._high = 0.0
 
     def update(self, balance: Balance, *, drives: bool) -> float:
-        """Add a balance; returns the change [-]."""
+        """Add a balance; returns that change [-]."""
         motion = balance.share - balance.unbalanced
         if not drives or balance.share != self._share:
             self.same_s, self._share = 0.0, balance.share
@@ -199,28 +195,24 @@ class _Frozen:
 
 
 class _Gain:
-    """Drive force per force that the motion takes: slope of a regression of one on the other, 1 if units are right.
+    """Drive force over the motion's force: a regression slope; 1 while variation is too small.
 
-    Both vary together as the machine starts, stops and climbs. Only their common variation counts, so neither zeros nor
-    resistances that stay the same matter. 1 until they have varied enough.
+    Only their common variation as the machine starts, stops and climbs counts, not bias or constant resistance. The
+    accelerometer's x shakes, which would flatten the slope. The motion by wheels and slope, z, has other errors and
+    serves as instrument: the slope is cov(z, y) / cov(z, x) (errors in variables; Wald 1940, Durbin 1954).
 
-    The accelerometer, which measures the motion's force x, shakes; that would make the slope look flat. So both are
-    compared with the motion by wheels and slope, z, whose errors are others: the slope is cov(z, y) / cov(z, x) (errors
-    in variables, by an instrument; Wald 1940, Durbin 1954), and cov(z, x) is the variance without the noise.
-
-    Resistance that varies with the motion does matter: sand takes force and slows the machine down, so that more force
-    comes with less acceleration, as if the sign were wrong. But sand resists all the time. With a wrong gain k, c_rr by
-    a balance is k c_rr plus (k - 1) times the motion's force, which falls below 0 as the machine climbs or slows down.
-    So a gain is wrong only if the ground seems to have pushed as well.
+    Varying resistance biases it: sand takes force and slows the machine, as if the sign were wrong. But with a wrong
+    gain k, a balance measures k c_rr plus (k - 1) times the motion's force, which turns negative in climbs or braking.
+    So a gain is wrong only if the ground seems to push as well.
     """
 
     def __init__(self) -> None:
-        self._means = (0.0, 0.0, 0.0)  # x, y and z, low-passed
+        self._means = (0.0, 0.0, 0.0)  # low-passed x, y and z
         self._sums: tuple[float, ...] = (0.0,) * 6  # weight; x, y, z; z x, z y
-        self._least = 0.0  # c_rr of late
+        self._least = 0.0  # recent minimum of c_rr
 
     def update(self, balance: Balance) -> None:
-        """Add a balance of a machine that drives."""
+        """Add a balance of a driving machine."""
         fade, share = math.exp(-balance.dt_s / FORGET_S), min(balance.dt_s / SMOOTH_S, 1.0)
         moves = balance.accel_mps2 / GRAVITY_MPS2 + math.sin(balance.slope_x)
         newest = (balance.share - balance.unbalanced, balance.share, moves)
@@ -232,12 +224,11 @@ class _Gain:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether no scale error of a sensor explains it, nor the ground."""
+        """Whether neither sensor scale nor ground explains it."""
         return self._least < PUSHES and not MIN_GAIN <= self._value <= MAX_GAIN
 
     @property
     def _value(self) -> float:
-        """The slope [-]."""
         weight = self._sums[0]
         if weight < LEAST_COMPARED_S:
             return 1.0

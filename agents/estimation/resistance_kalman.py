@@ -1,24 +1,20 @@
-"""Rolling resistance by a Kalman filter with a random walk that stops at borders, and a smoother that looks ahead.
+"""Rolling resistance by a Kalman filter with a random walk that stops at borders, and a smoother.
 
-State x = (c_lead, c_trail, e): c_rr under the leading and under the trailing axle, and the scale error of drive force
-over mass, where the mass is estimated. With w the leading axle's share of the load, a step of the balance measures
+State x = (c_lead, c_trail, e): c_rr under leading and trailing axle, and scale error of drive force over mass, if mass
+is estimated. With w the leading axle's load share, a step measures
 
     raw = h x + noise        h = (regressor w, regressor (1 - w), share)
 
-Both axles stand on the same ground until the leading one crosses a border; from there on the balance weighs two
-grounds, until the trailing axle has come up. Ground changes with the distance, so the random walk is per square root of
-a metre. With x, P before and x0, P0, x1, P1 at the present step, and T for the transpose,
+While the axles cross a border the balance weighs two grounds, else one. The random walk is per square root of a metre.
+x, P before; x0, P0 and x1, P1 at this step; T for transpose:
 
     predict   x0 = x, c_trail = c_lead on one ground    P0 = A P A^T + Q
     correct   K = P0 h^T / (h P0 h^T + r)               x1 = x0 + K (raw - h x0)    P1 = P0 - K h P0
     smooth    G = P A^T P0^-1                           xs = x + G (xs1 - x0)       Ps = P + G (Ps1 - P0) G^T
 
-(Rauch, Tung and Striebel 1965). A is the identity on one ground; at a border it forgets what was known under the
-leading axle, and at the end of a crossing the trailing axle takes over what is known under the leading one.
-
-Where borders are is another's question (`borders`), which is asked again at every step: where the answer has changed,
-the filter runs again from there, so that a border lies where it is and not where it was noticed. The smoother never
-crosses a border.
+(Rauch, Tung and Striebel 1965). A is the identity on one ground. At a border it forgets the leading axle's c_rr; after
+the crossing the trailing axle inherits it. `borders` locates borders anew at every step, and the filter reruns from the
+first change: a border lies where it is, not where it was noticed. The smoother never crosses one.
 """
 
 import math
@@ -35,19 +31,19 @@ from agents.estimation.tuning import TUNING, EstimationTuning
 from protocol.arrays import Floats
 
 LEAD, TRAIL, SCALE = 0, 1, 2
-KEPT = 100  # steps: 5 s, more than a sample waits for what comes after it
-NEAR_NS = 150_000_000  # a stamp this far from a usable step has no estimate
-PAUSE_S = 0.1  # steps further apart do not follow one another
-STEADY_S = 1.0  # for so long torque in steps has the same error, and counts as one measurement
+KEPT = 100  # steps, 5 s: longer than samples wait for later ones
+NEAR_NS = 150_000_000  # greatest distance of a stamp from a usable step
+PAUSE_S = 0.1  # gap that separates steps
+STEADY_S = 1.0  # time over which stepped torque has one error, and counts once
 
 IDENTITY = np.eye(3)
 TRAIL_IS_LEAD = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 LEAD_UNKNOWN = np.diag([0.0, 1.0, 1.0])
-TINY = 1e-14 * np.eye(3)  # both axles on the same ground: a covariance without inverse
+TINY = 1e-14 * np.eye(3)  # regularises a singular covariance on one ground
 
 
 class _Measured(NamedTuple):
-    """A step as it was measured: distance_m so far, h (3,), variance r, and the process noise of the scale error."""
+    """A measured step: total distance_m, h (3,), variance r, and process noise of the scale error."""
 
     step: BalanceStep
     distance_m: float
@@ -57,10 +53,10 @@ class _Measured(NamedTuple):
 
 
 class _Filtered(NamedTuple):
-    """A step as the filter has it.
+    """A filtered step.
 
-    border: whether the leading axle crossed one before it. crossing_m: distance at which the crossing under way began,
-    NaN if none is. A: transition from the step before (3, 3); x0, P0: belief before the measurement; x, P: after it.
+    border: crossed by the leading axle before it. crossing_m: start of the current crossing, else NaN. A: transition
+    (3, 3); x0, P0: belief before, x, P: after the measurement.
     """
 
     measured: _Measured
@@ -74,12 +70,11 @@ class _Filtered(NamedTuple):
 
     @property
     def is_crossing(self) -> bool:
-        """Whether the axles stand on two grounds."""
         return not math.isnan(self.crossing_m)
 
     @property
     def is_plain(self) -> bool:
-        """Whether both axles stood on the same ground, and still do."""
+        """Whether both axles stood and stand on one ground."""
         return self.A is IDENTITY and not self.is_crossing
 
 
@@ -89,19 +84,19 @@ class KalmanResistance:
     def __init__(self, *, estimates_mass: bool = False, tuning: EstimationTuning = TUNING) -> None:
         self._estimates_mass, self._tuning = estimates_mass, tuning
         self._steps: list[_Filtered] = []
-        self._first = _start(tuning, tuning.load_std**2 if estimates_mass else 0.0)  # the last step that is not kept
+        self._first = _start(tuning, tuning.load_std**2 if estimates_mass else 0.0)  # the last step that was dropped
         self._noise = _Noise(tuning)
         self._search = BorderSearch(2 * KEPT + 1, tuning)
         self._count = 0  # of all steps
-        self._load_has_changed = False  # since the last step
+        self._load_has_changed = False
 
     @property
     def scale(self) -> float:
-        """The scale error of drive force over mass [-]; 0 where it is not estimated."""
+        """Scale error of drive force over mass [-]; 0 if not estimated."""
         return float(self._before(len(self._steps)).x[SCALE])
 
     def update(self, step: BalanceStep) -> None:
-        """Filter a step, and search for a border."""
+        """Filter a step, and search for borders."""
         self._noise.update(step)
         scale_var = self._tuning.scale_walk**2 * step.dt_s if self._estimates_mass else 0.0
         if self._load_has_changed:
@@ -121,14 +116,11 @@ class KalmanResistance:
             del self._steps[:KEPT]
 
     def stand(self, *, changes_load: bool) -> None:
-        """Free the scale error, where it is estimated, if the load may change."""
+        """Release the scale error if the load may change."""
         self._load_has_changed = self._load_has_changed or (self._estimates_mass and changes_load)
 
     def recalibrate(self, zero: float, scale: float) -> None:
-        """Filter all steps again: the calibration that their raw values have applied has changed by so much.
-
-        So the ground does not seem to change where the calibration does.
-        """
+        """Filter all steps again with a changed calibration, so that the ground does not seem to change."""
         believed = float(self._before(len(self._steps)).x[LEAD])
         first = self._first.measured.step
         shift = (zero + scale * first.share) / first.regressor
@@ -141,19 +133,19 @@ class KalmanResistance:
             self._steps[i] = _filtered(
                 self._before(i), old.measured._replace(step=step), self._tuning, border=old.border
             )
-        # Ahead and in reverse a zero counts with opposite signs: what both come to, the filter knows.
+        # A bias counts with opposite signs ahead and in reverse; the filter knows the net effect.
         self._search.shift(float(self._before(len(self._steps)).x[LEAD]) - believed)
 
     def at(self, stamp_ns: int) -> tuple[float, float] | None:
-        """c_rr and its variance under the load centre at a recent stamp, smoothed by the steps after it."""
+        """Smoothed c_rr and variance under the load centre at a recent stamp."""
         index = bisect_left(self._steps, stamp_ns, key=lambda filtered: filtered.measured.step.stamp_ns)
         if index == len(self._steps) or self._stamp_ns(index) - stamp_ns > NEAR_NS:
-            index -= 1  # the step before may still be near
+            index -= 1  # the step before may be nearer
         if index < 0 or abs(self._stamp_ns(index) - stamp_ns) > NEAR_NS:
             return None
         filtered = self._steps[index]
         x, P = self._smoothed(index)
-        since_border_m = filtered.measured.distance_m - filtered.crossing_m  # NaN if no crossing is under way
+        since_border_m = filtered.measured.distance_m - filtered.crossing_m  # NaN without a crossing
         axle = TRAIL if since_border_m < filtered.measured.step.lead_m else LEAD
         return float(x[axle]), float(P[axle, axle])
 
@@ -164,7 +156,7 @@ class KalmanResistance:
         return self._steps[index - 1] if index else self._first
 
     def _set_borders(self, numbers: Collection[int]) -> None:
-        """Have borders before these steps, by their numbers; filter again from the first that changes."""
+        """Set borders before these steps; filter again from the first change."""
         first = self._count - len(self._steps) + 1
         borders = [number in numbers for number in range(first, self._count + 1)]
         changed = next((i for i, old in enumerate(self._steps) if old.border != borders[i]), len(borders))
@@ -176,7 +168,7 @@ class KalmanResistance:
         x, P = newest.x, newest.P
         for i in range(len(self._steps) - 2, index - 1, -1):
             here, after = self._steps[i], self._steps[i + 1]
-            if after.is_plain and not self._estimates_mass:  # both axles on one ground: a number, most of the time
+            if after.is_plain and not self._estimates_mass:  # scalar in the usual case, both axles on one ground
                 g = float(here.P[0, 0]) / float(after.P0[0, 0])
                 x = here.x + g * (x - after.x0)
                 P = here.P + g**2 * (P - after.P0)
@@ -187,9 +179,9 @@ class KalmanResistance:
 
 
 class _Noise:
-    """Density of the noise of raw c_rr [1/Hz]: half the mean square of the differences of successive steps.
+    """Noise density of raw c_rr [1/Hz]: half the mean squared difference of successive steps.
 
-    The ground's part of a difference is small; that of a border is an outlier.
+    The ground contributes little to it; a border is an outlier.
     """
 
     def __init__(self, tuning: EstimationTuning) -> None:
@@ -197,7 +189,6 @@ class _Noise:
         self._last: BalanceStep | None = None
 
     def interrupt(self) -> None:
-        """The next step does not follow the last one."""
         self._last = None
 
     def update(self, step: BalanceStep) -> None:
@@ -210,12 +201,10 @@ class _Noise:
 
 
 def _pause_s(last: BalanceStep, step: BalanceStep) -> float:
-    """Between the end of a step and the beginning of the next."""
     return (step.stamp_ns - last.stamp_ns) * 1e-9 - step.dt_s
 
 
 def _start(tuning: EstimationTuning, scale_var: float) -> _Filtered:
-    """The belief before the first step."""
     x, P = np.array([tuning.first_c_rr, tuning.first_c_rr, 0.0]), _same_ground(tuning.unknown_std**2)
     P[SCALE, SCALE] = scale_var
     measured = _Measured(BalanceStep(0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0, np.zeros(3), 1.0, 0.0)
@@ -223,17 +212,16 @@ def _start(tuning: EstimationTuning, scale_var: float) -> _Filtered:
 
 
 def _filtered(before: _Filtered, measured: _Measured, tuning: EstimationTuning, *, border: bool) -> _Filtered:
-    """Predict from the step before, and correct by the measurement."""
     step = measured.step
-    middle_m = measured.distance_m - step.distance_m / 2  # a step counts at its end, and shows the ground at its middle
+    middle_m = measured.distance_m - step.distance_m / 2  # a step shows the ground at its middle
     crossing_m = middle_m if border else before.crossing_m
     A, free = IDENTITY, 0.0
     if before.is_crossing and before.measured.step.regressor * step.regressor < 0:
-        # Back across a border that only one axle had crossed: the axle that led is the trailing one now.
+        # Back across a border that only one axle had crossed: leading and trailing axle swap.
         A, crossing_m, free = TRAIL_IS_LEAD, math.nan, tuning.unknown_std**2
     elif border:
         A, free = LEAD_UNKNOWN, tuning.unknown_std**2
-    if measured.distance_m - crossing_m >= step.wheelbase_m:  # the trailing axle has come up
+    if measured.distance_m - crossing_m >= step.wheelbase_m:  # the trailing axle has arrived
         A, crossing_m = (TRAIL_IS_LEAD @ A if step.wheelbase_m else TRAIL_IS_LEAD * [0, 0, 1]), math.nan
     on_one_ground = math.isnan(crossing_m)
     walk = tuning.walk**2 * step.distance_m
@@ -248,5 +236,5 @@ def _filtered(before: _Filtered, measured: _Measured, tuning: EstimationTuning, 
 
 
 def _same_ground(variance: float) -> Floats:
-    """Covariance (3, 3) of two axles on the same ground."""
+    """Covariance (3, 3) of two axles on one ground."""
     return np.array([[variance, variance, 0.0], [variance, variance, 0.0], [0.0, 0.0, 0.0]])

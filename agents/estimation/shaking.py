@@ -1,7 +1,7 @@
-"""How much a body shakes, by how much limits widen for that, and the longer steps in which it averages out.
+"""How much a body shakes, how far limits widen, and longer steps that average it out.
 
-Vibration changes from step to step, and the motion hardly does. A body that shakes goes nowhere: over n steps its mean
-falls with n, that of white noise with the root of n.
+Vibration changes from step to step, motion hardly. A shaking body goes nowhere: its mean over n steps falls with n, not
+with the root of n as white noise.
 """
 
 import math
@@ -10,14 +10,14 @@ from dataclasses import replace
 
 from agents.estimation.balance import BalanceStep
 
-MEASURED_S = 5.0  # over which it is measured: a hard shock counts for little, a start does soon
-SIGMA = 3.0  # a limit widens by so many standard deviations
-LONG_S = 0.301  # of steps in one, six of 50 ms: the estimators want one within 0.15 s of a stamp
-GAP_NS = 100_000_000  # between two steps that are not joined
+MEASURED_S = 5.0  # time constant: short shocks count little, a start soon
+SIGMA = 3.0  # standard deviations by which a limit widens
+LONG_S = 0.301  # duration of joined steps, six of 50 ms: estimators want one within 0.15 s of a stamp
+GAP_NS = 100_000_000  # gap that separates steps
 
 
 class Shaking:
-    """Follows a signal; usual: the standard deviation of a step, in its unit, that limits leave room for."""
+    """Follows a signal; usual: the standard deviation of a step that limits allow for."""
 
     def __init__(self, usual: float) -> None:
         self._usual = usual
@@ -32,27 +32,27 @@ class Shaking:
 
     @property
     def variance(self) -> float:
-        """Variance of a step beyond the usual one."""
+        """Variance of a step beyond the usual."""
         return max(self._variance - self._usual**2, 0.0)
 
     def margin(self, mean_s: float = 0.0) -> float:
-        """By how much a limit widens for a step, or for a low-pass of steps with this time constant."""
+        """Widening of a limit for a step, or for a low-pass of this time constant."""
         share = min(self._dt_s / mean_s, 1.0) if mean_s else 1.0
         return SIGMA * math.sqrt(self.variance * share / (2 - share))
 
 
 class LongerSteps:
-    """Joins steps of the force balance that follow one another, while the machine shakes."""
+    """Joins successive balance steps while the machine shakes."""
 
     def __init__(self) -> None:
         self._waiting: list[BalanceStep] = []
 
     def clear(self) -> None:
-        """Forget the steps that wait for others."""
+        """Drop waiting steps."""
         self._waiting.clear()
 
     def add(self, step: BalanceStep, *, shakes: bool) -> list[BalanceStep]:
-        """The steps that are ready with this one."""
+        """The steps that this one completes."""
         ready = []
         if self._waiting and not _follows(self._waiting[-1], step):
             ready.append(self._joined())
@@ -68,12 +68,11 @@ class LongerSteps:
 
 
 def _follows(last: BalanceStep, step: BalanceStep) -> bool:
-    """Whether a step follows the last one in the same direction."""
     return last.regressor * step.regressor > 0 and step.stamp_ns - last.stamp_ns <= GAP_NS
 
 
 def _join(steps: Sequence[BalanceStep]) -> BalanceStep:
-    """One step in place of several: sums of time and distance, means of the rest."""
+    """Sums of time and distance, means of the rest."""
     count = len(steps)
     return replace(
         steps[-1],

@@ -1,28 +1,25 @@
-"""What tunes the estimators of the ground: one frozen set of constants, which experiments replace."""
+"""Tuning of ground estimation: one frozen set of constants, which experiments replace."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class EstimationTuning:
-    """All constants of the filters over c_rr, of the search for borders, and of the calibration at work.
+    """Constants of the c_rr filters, the border search and the calibration.
 
-    first_c_rr, unknown_std: c_rr at first, and how unsure it is then and behind a border. noise: least density of the
-    noise of raw c_rr [1/sqrt(Hz)], measured over noise_s; a square beyond outlier times the mean is a border, not
-    noise. walk: random walk of c_rr [1/sqrt(m)], as ground of one kind is never quite even. scale_walk [1/sqrt(s)],
-    load_std: of the scale error where the mass is estimated, at first and when the load has changed (3.5 t of 17.5 t).
+    first_c_rr, unknown_std: c_rr at first, and its deviation then and behind borders. noise: least noise density of raw
+    c_rr [1/sqrt(Hz)], over noise_s; a square beyond outlier times the mean is a border. walk: of c_rr on one ground
+    [1/sqrt(m)]. scale_walk [1/sqrt(s)], load_std: of an estimated scale error, at first and after loading (3.5 t of
+    17.5 t).
 
-    borders_per_m: maps with five times as many hardly differ. coloured: the noise as the search takes it, times its
-    variance, as a torque's error lasts a second; uneven: its random walk on one ground [1/sqrt(m)]; likely: a square
-    beyond so many times the variance counts as so many, so that a single jolt is no border.
+    borders_per_m: five times as many hardly matter. coloured: factor of the search's noise variance, as torque errors
+    last a second; uneven: its walk on one ground [1/sqrt(m)]; likely: cap of a normalised square, so that one shock is
+    no border. model_std: error of the balance [-] that calibration leaves.
 
-    model_std: error of the balance itself [-], which no calibration removes.
-
-    stretch_m: distance that is averaged, as long as a sample stands for; stretch_std: of its mean unbalanced. pair_m,
-    pair_rad, pair_s: two passages so near, alike and soon are over the same ground; dead reckoning drifts. floor: no
-    number of pairs makes the zero surer, or the scale than ten times it. gate_sigma: pairs further off are excluded;
-    relock, relock_tours: so many excluded in a row are right (tours are minutes apart). gate_offer_sigma: an offer is
-    of many samples, so that further off one of both is wrong, and a person has to look.
+    stretch_m: averaged distance, as a sample's; stretch_std: of its mean. pair_m, pair_rad, pair_s: limits of two
+    passages over the same ground by dead reckoning. floor: least deviation of the bias, a tenth of the scale's.
+    gate_sigma: gate of pairs; relock, relock_tours: exclusions in a row that count as right. gate_offer_sigma: beyond
+    it an offer or the machine is wrong, and a person has to look.
     """
 
     first_c_rr: float = 0.03

@@ -1,8 +1,7 @@
-"""Beliefs, motions and measurements: the values between the parts of localisation; and changes of a belief.
+"""Beliefs, motions, measurements, and changes of a belief.
 
-x: mean (n,), P: covariance (n, n), z: measurement (k,), R: its covariance (k, k), as in the filtering literature.
-
-Whatever changes a belief but motions and measurements is here, since it maps the belief's past too (`smoother`).
+x: mean (n,), P: covariance (n, n), z: measurement (k,), R: its covariance (k, k). All changes except motions and
+measurements are here, as they map the belief's past too (`smoother`).
 """
 
 from collections.abc import Callable
@@ -19,10 +18,9 @@ from protocol.rotations import wrap_angle
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """Mean and covariance of the state at a stamp; neither is written to.
+    """Mean and covariance of the state at a stamp; immutable.
 
-    L: lower Cholesky factor of P, where it is known already; it saves computing it again. past: what it still says of
-    the past, None where nothing is smoothed.
+    L: lower Cholesky factor of P, if known. past: what it says of the past, None without smoothing.
     """
 
     stamp_ns: int
@@ -40,10 +38,9 @@ Model = Callable[[Floats], Floats]  # of states
 class Motion:
     """How the state moves over a time step.
 
-    f: states (m, n) after the step from those before it, angles not wrapped. jacobian: df/dx (n, n) at a state (n,).
-    Q: noise (n, n). angles: components of the state that are angles [rad]; a filter brings their mean into +-pi.
-    at_centre: the mean moves as one state would, and is not the mean of all that the belief holds for possible. Places
-    under an unsure heading lie on an arc, and their mean inside of it, where no machine can be.
+    f: states (m, n) after the step, angles not wrapped. jacobian: df/dx (n, n) at a state (n,). Q: noise (n, n).
+    angles: components that are angles [rad]; a filter wraps their mean. at_centre: the mean moves as one state, not as
+    the mean of the belief: under an uncertain heading that mean lies inside an arc of places, where no machine can be.
     """
 
     f: Model
@@ -55,15 +52,13 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A value of a sensor, with the model of the sensor: z = h(x) + noise of covariance R.
+    """A sensor value with its model: z = h(x) + noise of covariance R.
 
-    h: measurements (m, k) that states (m, n) would give. jacobian: dh/dx (k, n) at a state (n,). angles: components of
-    z that are angles [rad]. gate_sigma: refused if the innovation is this many standard deviations off, 0 never.
-    relocks: accepted again after too many refusals in a row; false for assumptions, which no sensor measures. opens:
-    states, (k,) each, that become as unsure as the measurement is off then, each on its own: they share what it is off
-    by their variances, and the others follow by themselves. change: made to the belief at its stamp before any
-    measurement, as when a state that was unknown gets its first value. considers: states that it depends on, and does
-    not change (Schmidt-Kalman: Schmidt 1966).
+    h: predicted measurements (m, k) of states (m, n). jacobian: dh/dx (k, n) at a state (n,). angles: components of z
+    that are angles [rad]. gate_sigma: gate in standard deviations, 0 for none. relocks: accepted after too many
+    refusals; false for assumptions. opens: states, (k,) each, whose variance then grows by the innovation; they share
+    it by their variances. change: applied to the belief first, as when an unknown state gets its first value.
+    considers: states it depends on but does not change (Schmidt-Kalman: Schmidt 1966).
     """
 
     sensor: str
@@ -80,17 +75,17 @@ class Measurement:
     considers: tuple[int, ...] = ()
 
     def at(self, stamp_ns: int, z: Floats) -> "Measurement":
-        """Another value of the same sensor, with the same model; `replace` takes three times as long."""
+        """Another value with the same model; three times as fast as `replace`."""
         model, rest = (self.R, self.h, self.jacobian), (self.angles, self.gate_sigma, self.relocks)
         return Measurement(self.sensor, stamp_ns, z, *model, *rest, self.opens, self.change, self.considers)
 
 
 @dataclass(frozen=True, slots=True)
 class Conditioned:
-    """A belief after a measurement: the prior unchanged where that was refused.
+    """A belief after a measurement, or the unchanged prior.
 
-    innovation: (k,), its covariance: (k, k), nis: normalised innovation squared [-], NaN where nothing could be
-    computed. accepted: whether the belief is conditioned on the measurement.
+    innovation: (k,), its covariance: (k, k), nis: normalised innovation squared [-], NaN if not computable. accepted:
+    whether the belief is conditioned.
     """
 
     belief: Belief
@@ -102,9 +97,9 @@ class Conditioned:
 
 @dataclass(frozen=True)
 class PoseBelief:
-    """Pose in `map` at a stamp: position [m], heading [rad, in +-pi], speed [m/s], covariance (2, 2) [m2].
+    """Pose in `map`: position [m], heading [rad, in +-pi], speed [m/s], covariance (2, 2) [m2].
 
-    aid_share: how much of the position came from lanes, 0 to 1.
+    aid_share: share of the position that came from lanes, 0 to 1.
     """
 
     stamp_ns: int
@@ -117,21 +112,21 @@ class PoseBelief:
 
 
 class DivergedError(ArithmeticError):
-    """What a filter computed is no covariance: nothing is left to go on with but a new start."""
+    """The result of a filter is no covariance: it has to start again."""
 
 
 class Filter(Protocol):
-    """An EKF or UKF: pure steps, equal to use. One that does not repair its covariance raises DivergedError."""
+    """An EKF or UKF of pure steps. DivergedError if it does not repair its covariance."""
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
-        """Move the belief through a motion, to its new stamp."""
+        """Move the belief to a stamp."""
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
-        """Condition the belief on a measurement of its stamp."""
+        """Condition on a measurement of the belief's stamp."""
 
 
 def pose_of(belief: Belief, wheels_mps: float | None, aid_share: float = 0.0) -> PoseBelief:
-    """The pose that a belief holds, with the wheels' speed; None: with its own."""
+    """The belief's pose, with the wheels' speed; None: its own."""
     speed_mps = float(belief.x[SPEED]) if wheels_mps is None else wheels_mps
     x, y, heading = float(belief.x[X]), float(belief.x[Y]), wrap_angle(float(belief.x[YAW]))
     return PoseBelief(belief.stamp_ns, x, y, heading, speed_mps, belief.P[:2, :2].copy(), aid_share)
@@ -141,7 +136,7 @@ def pose_of(belief: Belief, wheels_mps: float | None, aid_share: float = 0.0) ->
 
 
 def extended(belief: Belief, variance: Floats) -> Belief:
-    """The belief with more states at its end, zero, of variances (k,), and correlated with nothing."""
+    """Append zero states of variances (k,), uncorrelated."""
     n, more = len(belief.x), len(variance)
     P = np.diag(np.concatenate([np.zeros(n), variance]))
     P[:n, :n] = belief.P
@@ -150,7 +145,7 @@ def extended(belief: Belief, variance: Floats) -> Belief:
 
 
 def reset_states(belief: Belief, states: slice, variance: float) -> Belief:
-    """The belief with these states at zero, of this variance and correlated with nothing."""
+    """Set states to zero with this variance, uncorrelated."""
     x, P, M = belief.x.copy(), belief.P.copy(), np.eye(len(belief.x))
     x[states], P[states, :], P[:, states], M[states] = 0.0, 0.0, 0.0, 0.0
     P[states, states] = np.eye(states.stop - states.start) * variance
@@ -158,10 +153,10 @@ def reset_states(belief: Belief, states: slice, variance: float) -> Belief:
 
 
 def anchor_states(belief: Belief, states: slice, H: Floats, variance: float) -> Belief:
-    """The belief with states e (k,) for the error of an anchor: e = -H (x_true - x) + v.
+    """Set states e (k,) to the error of an anchor: e = -H (x_true - x) + v.
 
-    H (k, n): Jacobian of what is anchored. variance: of v, whatever else makes the anchor wrong. A value that counts
-    from the anchor measures H x + e, which is independent of x at this moment.
+    H (k, n): Jacobian of what is anchored. variance: of v, the anchor's other errors. A value relative to the anchor
+    measures H x + e, independent of x at this moment.
     """
     anchored = reset_states(belief, states, variance)
     P, M, others = anchored.P, np.eye(len(anchored.x)), np.ones(len(anchored.x), bool)
@@ -175,17 +170,17 @@ def anchor_states(belief: Belief, states: slice, H: Floats, variance: float) -> 
 
 
 def open_states(belief: Belief, states: slice, covariance: Floats) -> Belief:
-    """The belief with these states (k,) less sure by a covariance (k, k)."""
+    """Add a covariance (k, k) to these states (k,)."""
     P = belief.P.copy()
     P[states, states] += covariance
     return Belief(belief.stamp_ns, belief.x, P, past=belief.past)
 
 
 def restate_states(belief: Belief, states: slice, before: float, after: float) -> Belief:
-    """The belief with a stationary error of this variance instead of the one before.
+    """Change the variance of a stationary error.
 
-    An error is a sum of errors that come and go: one that grows gets another part, which is independent of it. One that
-    shrinks from e keeps, of variances s before and r after, r / s of it: the part that stays has covariance r with e.
+    An error is a sum of errors that come and go. A growing one gains an independent part. One that shrinks from e, with
+    variances s before and r after, keeps r / s of e: the remaining part has covariance r with e.
     """
     kept = min(after / before, 1.0)
     x, M = belief.x.copy(), np.eye(len(belief.x))

@@ -1,4 +1,4 @@
-"""The extended Kalman filter. x, P: belief, F: the motion's Jacobian, Q: its noise, L: lower factor of P."""
+"""The extended Kalman filter. x, P: belief, F: motion Jacobian, Q: its noise, L: lower factor of P."""
 
 from dataclasses import dataclass
 
@@ -10,16 +10,16 @@ from agents.localisation.filters.square_root import conclude, conclude_motion, n
 
 @dataclass(frozen=True)
 class Ekf:
-    """Linearises at the mean; exact where motion and measurement are linear."""
+    """Linearises at the mean; exact for linear models."""
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
-        """Move the belief: x <- f(x), P <- F P F^T + Q, as the square of F L so that it is symmetric."""
+        """Predict: x <- f(x), P <- F P F^T + Q, as the square of F L for symmetry."""
         F = motion.jacobian(belief.x)
         F_L = F.dot(root(belief))
         return conclude_motion(belief, motion, stamp_ns, motion.f(belief.x[None])[0], F_L.dot(F_L.T) + motion.Q, F)
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
-        """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
+        """Condition; the prior if unusable or gated."""
         noise = noise_root(measurement)
         if noise is None:
             return refused(belief, measurement)

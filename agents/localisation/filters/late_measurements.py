@@ -1,7 +1,6 @@
-"""Measurements in any order: a filter with a history, which goes back to the stamp of a late measurement.
+"""Measurements in any order: a filter with a history, re-filtered from the stamp of a late measurement.
 
-The history holds nodes: a stamp, the measurements of that stamp, and the belief after them. A measurement that comes
-late is put into its place, and everything after it is filtered again.
+A node has a stamp, its measurements, and the belief after them.
 """
 
 import math
@@ -19,14 +18,14 @@ from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.tuning import TUNING
 from protocol.arrays import Floats
 
-WINDOW_S = 1.0  # how far back measurements may come; receivers and networks are late by less
+WINDOW_S = 1.0  # greatest lateness; receivers and networks need less
 NO_SENSOR: frozenset[str] = frozenset()
 _stamp = attrgetter("stamp_ns")
 
 
 @dataclass
 class _Node:
-    """One stamp. reopened: sensors that were accepted again here after too many refusals."""
+    """One stamp. reopened: sensors relocked here."""
 
     stamp_ns: int
     measurements: list[Measurement] = field(default_factory=list)
@@ -37,9 +36,8 @@ class _Node:
 class Fusion:
     """Filters measurements into beliefs.
 
-    model: how the machine moves; it is replaced as more is known, and holds for all that is filtered from then on.
-    counters: measurements used, gated and refused, by sensor. last: the newest result of each sensor. window_s:
-    as WINDOW_S. relock: as of a LocalisationTuning.
+    model: motion model; a new one holds from then on. counters: measurements used, gated and refused, by sensor. last:
+    each sensor's newest result. window_s: as WINDOW_S. relock: as in LocalisationTuning.
     """
 
     def __init__(
@@ -62,7 +60,7 @@ class Fusion:
         return belief
 
     def at(self, stamp_ns: int) -> Belief:
-        """The belief at a stamp: the last one before it, moved on."""
+        """The belief at a stamp, predicted from the last one before."""
         index = bisect_right(self._nodes, stamp_ns, key=_stamp) - 1
         belief = self._nodes[max(index, 0)].belief
         assert belief is not None
@@ -71,14 +69,14 @@ class Fusion:
     def take_smoothed(self) -> list[SmoothedPose]:
         """Poses that left the smoother's lag since the last call, oldest first.
 
-        They are those of beliefs that no late measurement can change any more, so its order of arrival is all one.
+        No late measurement can change them, so the order of arrival does not matter.
         """
         taken, self._smoothed = self._smoothed, []
         return taken
 
     def remaining(self) -> list[SmoothedPose]:
-        """Poses within the smoother's lag, as known by now, and that of the newest belief; none without a lag."""
-        beliefs = [node.belief for node in self._nodes if node.belief]  # a filter that failed left the newest without
+        """Poses within the smoother's lag as known now, and the newest belief's; none without a lag."""
+        beliefs = [node.belief for node in self._nodes if node.belief]  # a failed filter leaves the newest node without
         newest = beliefs[-1]
         if newest.past is None:
             return []
@@ -86,13 +84,13 @@ class Fusion:
         return left + newest.past.poses(newest.stamp_ns, newest.x, newest.P)
 
     def extend(self, model: MotionModel, variance: Floats) -> None:
-        """Estimate more states from here on, those that a model has beyond the others, with variances (k,)."""
+        """Append the further states of a model, with variances (k,)."""
         self.model = model
         for node in self._nodes:
             node.belief = node.belief and extended(node.belief, variance)
 
     def add(self, measurements: Sequence[Measurement]) -> list[Belief]:
-        """Filter measurements of one stamp; returns the beliefs that they changed, oldest first, none if refused."""
+        """Filter measurements of one stamp; returns the changed beliefs, oldest first."""
         stamp_ns = measurements[0].stamp_ns
         if self._is_too_late(stamp_ns):
             self.counters["too_late"] += len(measurements)
@@ -105,7 +103,7 @@ class Fusion:
         if not fresh:
             return []
         node.measurements += fresh.values()
-        if index == len(self._nodes) - 1 and node.belief is not None:  # more of the same stamp: nothing to do again
+        if index == len(self._nodes) - 1 and node.belief is not None:  # same stamp as the newest: nothing to repeat
             node.belief = self._condition(_changed(node.belief, fresh.values()), node, fresh.values(), fresh.keys())
         else:
             self._filter_from(index, fresh.keys())
@@ -114,20 +112,20 @@ class Fusion:
         return changed
 
     def _is_too_late(self, stamp_ns: int) -> bool:
-        """Whether it lies before the window, or not after the first node, whose belief stands."""
+        """Whether it precedes the window or would change the first node."""
         first, newest = self._nodes[0], self._nodes[-1]
         before = stamp_ns < max(first.stamp_ns, newest.stamp_ns - self._window_ns)
         return before or (stamp_ns == first.stamp_ns and first is not newest)
 
     def _place(self, stamp_ns: int) -> int:
-        """Index of the node of a stamp, which is made if there is none."""
+        """Index of the node of a stamp, new if necessary."""
         index = bisect_left(self._nodes, stamp_ns, key=_stamp)
         if index == len(self._nodes) or self._nodes[index].stamp_ns != stamp_ns:
             self._nodes.insert(index, _Node(stamp_ns))
         return index
 
     def _filter_from(self, index: int, fresh: Collection[str]) -> None:
-        """Filter from a node on, at which these sensors are new; the node before it stands."""
+        """Filter from a node on, at which these sensors are new."""
         for i in range(index, len(self._nodes)):
             before, node = self._nodes[i - 1].belief, self._nodes[i]
             assert before is not None
@@ -144,7 +142,7 @@ class Fusion:
     def _condition(
         self, belief: Belief, node: _Node, measurements: Iterable[Measurement], fresh: Collection[str]
     ) -> Belief:
-        """Condition on measurements in turn; only fresh ones count, those filtered again were counted before."""
+        """Condition in turn; only fresh measurements are counted."""
         for measurement in measurements:
             result = self._engine.condition(belief, measurement)
             if measurement.sensor in fresh:
@@ -157,7 +155,7 @@ class Fusion:
         return belief
 
     def _judge(self, node: _Node, measurement: Measurement, result: Conditioned) -> None:
-        """Count, and accept a sensor again that was refused too often."""
+        """Count, and relock a sensor refused too often."""
         sensor = measurement.sensor
         self.last[sensor] = result
         if result.accepted:
@@ -175,10 +173,10 @@ class Fusion:
             node.reopened.add(sensor)
 
     def _forget(self) -> None:
-        """Drop nodes that are older than the window; one before it stays to start from."""
+        """Drop nodes before the window, except one to start from."""
         oldest_ns = self._nodes[-1].stamp_ns - self._window_ns
         recent = next((i for i, node in enumerate(self._nodes) if node.stamp_ns > oldest_ns), len(self._nodes))
-        stands = max(recent - 1, 0)  # mostly one or two: no search is faster than a look at the first ones
+        stands = max(recent - 1, 0)  # usually one or two, so no search
         for node in self._nodes[:stands]:
             if node.belief and node.belief.past:
                 self._smoothed += node.belief.past.final
@@ -193,5 +191,4 @@ def _changed(belief: Belief, measurements: Iterable[Measurement]) -> Belief:
 
 
 def _opened(belief: Belief, innovation: Floats, states: slice) -> Belief:
-    """The belief with states as unsure as a measurement of them is off."""
     return open_states(belief, states, np.outer(innovation, innovation) + np.eye(len(innovation)))

@@ -1,16 +1,16 @@
-"""How the machine moves: omnidirectional, with constant acceleration and turn rate, as in robot_localization.
+"""Motion model: omnidirectional, constant acceleration and turn rate, as in robot_localization.
 
-Over a step dt, with R = map_from_base and E the matrix from body rates to the rates of roll, pitch and yaw
-(Diebel 2006, "Representing attitude"; robot_localization, ekf.cpp, `predict`):
+Over a step dt, with R = map_from_base and E the matrix from body rates to rates of roll, pitch and yaw (Diebel 2006,
+"Representing attitude"; robot_localization, ekf.cpp, `predict`):
 
     position += R (velocity dt + acceleration dt^2 / 2)        attitude += E rate dt
     velocity += acceleration dt                                rate, acceleration, biases, scale stay
-    error of an absolute heading, and how far beside the fleet's lanes it drives *= exp(-dt / tau)
-    GPS error *= exp(-dt / tau), of its own tau; what several receivers see, such as one sky, moves all their errors
+    heading reference errors, offset from the fleet's lanes *= exp(-dt / tau)
+    GPS errors *= exp(-dt / tau), each with its tau; common noise, such as one sky, moves all
 
-`velocity` is that of base_link's origin in its own axes and `acceleration` its rate of change; what an accelerometer
-measures besides (rate x velocity, gravity) belongs to the measurement. On a plane (two_d_mode of robot_localization)
-the states off it are zero before and after each step, with a small variance so that the covariance stays definite.
+`acceleration` is the rate of change of `velocity`, base_link's in its own axes; the accelerometer's other terms (rate x
+velocity, gravity) are the measurement's. On a plane (two_d_mode of robot_localization) states off it stay zero, with a
+small variance that keeps the covariance definite.
 """
 
 import math
@@ -38,19 +38,18 @@ from agents.localisation.filters.state import (
 from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats
 
-OFF_PLANE_VARIANCE = 1e-6  # of states that are zero on a plane, as robot_localization measures them
+OFF_PLANE_VARIANCE = 1e-6  # of zero states on a plane, as in robot_localization
 EYE = np.eye(3)
-MIN_COS_PITCH = 0.05  # Euler angles are singular at +-90 deg; no machine drives there, but a sigma point may
-OFFSET_WALK = 1e-3  # offset of the map [m/sqrt(s)]: one that is drawn of many days stays where it is
-BESIDE_STD_M, BESIDE_S = 2.0, 300.0  # how far beside the fleet's lanes a machine keeps, and for how long so
+MIN_COS_PITCH = 0.05  # Euler angles are singular at +-90 deg, where a sigma point may be
+OFFSET_WALK = 1e-3  # of the map's offset [m/sqrt(s)]: a map of many days stays
+BESIDE_STD_M, BESIDE_S = 2.0, 300.0  # lateral offset from the fleet's lanes, and its correlation time
 
 
 @dataclass(frozen=True)
 class GpsError:
-    """A receiver's slow error: a stationary Gauss-Markov process per axis, of that variance and correlation time.
+    """A receiver's slow error: a stationary Gauss-Markov process per axis.
 
-    common_m2: the part of the variance that the machine's other receivers see too. Two receivers have the smaller of
-    their parts in common, since it is one error in metres.
+    common_m2: shared with the machine's other receivers; two share the smaller value.
     """
 
     variance_m2: float
@@ -66,7 +65,7 @@ class GpsError:
 
 @dataclass(frozen=True)
 class HeadingError:
-    """The error of a reference's absolute heading: a stationary Gauss-Markov process."""
+    """Error of a reference's absolute heading: a stationary Gauss-Markov process."""
 
     std_rad: float
     time_s: float
@@ -76,11 +75,10 @@ class HeadingError:
 class MotionModel:
     """What the motion depends on besides the belief.
 
-    on_plane: whether the machine moves on a plane. gps_errors: one per receiver of the layout. heading_errors:
-    of the first references of the layout; headings of the others count from an anchor, and their errors walk. traction:
-    drive force over weight [-], 0 where it is not known; slip_std: of the wheels' slip per traction. turn_error_radps:
-    standard deviation of the lasting error of an odometry's turn rate, 0 where the turn comes from another sensor.
-    reckons: whether nothing shows the place. turns_unseen: whether no sensor shows the turn.
+    gps_errors: one per receiver of the layout. heading_errors: of its first references; those of anchored ones walk.
+    traction: drive force over weight [-], 0 if unknown; slip_std: of wheel slip per traction. turn_error_radps:
+    deviation of odometry's lasting turn-rate error, else 0. reckons: no sensor shows the place; turns_unseen: none the
+    turn.
     """
 
     layout: Layout
@@ -103,19 +101,19 @@ class MotionModel:
     def driven(
         self, heading_errors: tuple[HeadingError, ...], traction: float, slip_std: float, *, reckons: bool
     ) -> "MotionModel":
-        """The model of another step; `replace` takes four times as long."""
+        """The model of another step; four times as fast as `replace`."""
         sensors = (self.layout, self.on_plane, self.gps_errors, heading_errors)
         own = (reckons, self.turns_unseen, self.tuning)
         return MotionModel(*sensors, traction, slip_std, self.turn_error_radps, *own)
 
     @property
     def max_step_ns(self) -> int:
-        """Longest step, within which a motion is straight: sensors of the turn make short ones, fixes alone do not."""
+        """Longest straight step: turn sensors make steps short, fixes alone do not."""
         return 250_000_000 if self.turns_unseen else sys.maxsize
 
 
 def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
-    """The motion over dt_s from a belief, whose attitude and velocity direct the slip noise."""
+    """The motion over dt_s; attitude and velocity of the belief direct the slip noise."""
     layout, tuning = model.layout, model.tuning
     keep, walks = _constants(layout, tuning, on_plane=model.on_plane)
     scale, Q = keep.copy(), walks * dt_s
@@ -124,7 +122,7 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     if model.gps_errors:
         gps = layout.gps_errors
         scale[gps], new_shares = _fading(tuple([error.time_s for error in model.gps_errors]), dt_s)
-        rows = zip(_gps_covariance(model.gps_errors), new_shares, strict=True)  # no arrays: they are so small
+        rows = zip(_gps_covariance(model.gps_errors), new_shares, strict=True)  # lists: faster than arrays this small
         noise = [[value * share for value, share in zip(*row, strict=True)] for row in rows]
         for east_or_north in (gps.start, gps.start + 1):
             Q[east_or_north : gps.stop : 2, east_or_north : gps.stop : 2] = noise
@@ -137,13 +135,13 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
         Q[beside, beside] = BESIDE_STD_M**2 * -math.expm1(-2 * dt_s / BESIDE_S)
     of_position = Q[POSITION, POSITION]
     slip_mps = model.slip_std * model.traction * float(belief.x[SPEED])
-    # The integral of a Gauss-Markov error of slip_s grows by 2 std^2 time per second.
+    # A Gauss-Markov error of slip_s, integrated, grows by 2 std^2 time per second.
     of_position += _slip(belief.x * scale, dt_s, 2 * tuning.slip_s * slip_mps**2 * dt_s, tuning)
     if model.turn_error_radps:
         turn = layout.gyro_biases.stop - 1
         Q[turn, turn] += 2 * model.turn_error_radps**2 * dt_s / tuning.bend_s
 
-    if model.turns_unseen:  # a stationary Gauss-Markov process: a machine that stands does not turn
+    if model.turns_unseen:  # Gauss-Markov: no turn at rest
         bends_radps = min(tuning.curvature * abs(float(belief.x[SPEED])), tuning.max_turn_radps)
         std_radps = bends_radps + tuning.least_turn_radps
         scale[YAW_RATE] = math.exp(-dt_s / tuning.turn_s)
@@ -159,9 +157,9 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
 
 
 def gps_covariance(errors: tuple[GpsError, ...]) -> Floats:
-    """Covariance (k, k) of the slow errors of k receivers, per axis [m2].
+    """Covariance (k, k) of k receivers' slow errors, per axis [m2].
 
-    What they have in common answers to one noise: with correlation times t and u, 2 sqrt(t u) / (t + u) of it is left.
+    Of the common part, with correlation times t and u, 2 sqrt(t u) / (t + u) remains.
     """
     return np.array(_gps_covariance(errors))
 
@@ -182,7 +180,7 @@ def map_from_base(attitude: Floats) -> Floats:
 
 
 def turned_jacobian(attitude: Floats, arm: Floats) -> tuple[tuple[float, float, float], ...]:
-    """Derivative (3, 3) of map_from_base(attitude) arm by roll, pitch, yaw, of an arm (3,)."""
+    """Derivative (3, 3) of map_from_base(attitude) arm by roll, pitch, yaw."""
     (cr, cp, cy), (sr, sp, sy) = _trigonometry(attitude.tolist())
     forward, left, up = arm.tolist()
     left, up = cr * left - sr * up, sr * left + cr * up
@@ -195,7 +193,7 @@ def turned_jacobian(attitude: Floats, arm: Floats) -> tuple[tuple[float, float, 
 
 
 def _axes(attitude: Sequence[float]) -> tuple[tuple[float, float, float], ...]:
-    """Forward, left and up of the body in map: the columns of map_from_base."""
+    """Columns of map_from_base: forward, left, up."""
     (cr, cp, cy), (sr, sp, sy) = _trigonometry(attitude)
     return (
         (cy * cp, sy * cp, -sp),
@@ -205,22 +203,21 @@ def _axes(attitude: Sequence[float]) -> tuple[tuple[float, float, float], ...]:
 
 
 def _trigonometry(attitude: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Cosines and sines of roll, pitch and yaw."""
     return tuple(map(math.cos, attitude)), tuple(map(math.sin, attitude))
 
 
 def _moved(states: Floats, scale: Floats, dt_s: float) -> Floats:
-    """States (m, n) after a step, multiplied by scale (n,) before; angles are not wrapped.
+    """States (m, n) after a step, first scaled by (n,); angles not wrapped.
 
-    A turn by an angle is a product of complex numbers: fewer calls than with sines and cosines, so a fifth faster.
+    Complex products take fewer calls than sines and cosines: a fifth faster.
     """
-    rows = np.multiply(states.T, scale[:, None], order="C")  # a row each of x, y, z, roll, ...: their values adjoin
+    rows = np.multiply(states.T, scale[:, None], order="C")  # contiguous rows of x, y, z, roll, ...
     by_roll, by_pitch, by_yaw = np.exp(1j * rows[ATTITUDE])
     velocity, half = rows[VELOCITY], rows[ACCELERATION] * (dt_s / 2)
-    velocity += half  # that of the middle of the step
-    steps = (rows[VELOCITY.start : RATE.stop] * dt_s).reshape(2, 3, -1)  # shift along the body, turn about it
     velocity += half
-    rolled = np.empty((2, len(by_roll)), complex)  # left + i up, of both: R and E begin with the roll
+    steps = (rows[VELOCITY.start : RATE.stop] * dt_s).reshape(2, 3, -1)  # shift along the body, and turn about it
+    velocity += half
+    rolled = np.empty((2, len(by_roll)), complex)  # left + i up of both, as R and E begin with the roll
     rolled.real, rolled.imag = steps[:, 1], steps[:, 2]
     rolled *= by_roll
     shift, turn = rolled
@@ -230,7 +227,7 @@ def _moved(states: Floats, scale: Floats, dt_s: float) -> Floats:
     level = np.empty_like(shift)  # east + i north
     level.real, level.imag = pitched.imag, shift.real
     level *= by_yaw
-    change = np.empty((6, len(shift)))  # of position and attitude
+    change = np.empty((6, len(shift)))
     change[0], change[1], change[2], change[4] = level.real, level.imag, pitched.real, turn.real
     yawed = np.multiply(turn.imag, _secant(by_pitch.real), out=change[5])
     np.multiply(by_pitch.imag, yawed, out=change[3])
@@ -240,12 +237,11 @@ def _moved(states: Floats, scale: Floats, dt_s: float) -> Floats:
 
 
 def _secant(cosine: Floats) -> Floats:
-    """1 / cos of the pitch, which goes to zero where the cosine does."""
+    """1 / cos of the pitch, bounded near zero."""
     return cosine / np.maximum(cosine * cosine, MIN_COS_PITCH**2)
 
 
 def _jacobian(x: Floats, dt_s: float) -> Floats:
-    """Derivative (n, n) of `_moved` at a state (n,)."""
     attitude = x[ATTITUDE]
     (cr, cp, _), (sr, sp, _) = _trigonometry(attitude.tolist())
     _, q, r = (x[RATE] * dt_s).tolist()
@@ -271,7 +267,7 @@ def _jacobian(x: Floats, dt_s: float) -> Floats:
 
 
 def _slip(x: Floats, dt_s: float, along_m2: float, tuning: LocalisationTuning) -> Floats:
-    """Variance (3, 3) in map of the distance driven in a step [m2]; along_m2: added along the body."""
+    """Variance (3, 3) of a step's distance in map [m2]; along_m2: extra, along the body."""
     distance_m = math.hypot(*x[VELOCITY][:2].tolist()) * dt_s
     along = math.sqrt(tuning.slip_along**2 * distance_m + along_m2)
     across = tuning.slip_across * math.sqrt(distance_m)
@@ -283,20 +279,14 @@ def _slip(x: Floats, dt_s: float, along_m2: float, tuning: LocalisationTuning) -
 
 @lru_cache
 def _fading(times_s: tuple[float, ...], dt_s: float) -> tuple[Floats, tuple[tuple[float, ...], ...]]:
-    """Factors (2 k,) by which errors of k receivers fade in a step, and the shares (k, k) of them that are renewed.
-
-    Exact for steps of any length: what fades is renewed, so that the covariance stays.
-    """
+    """Decay factors (2 k,) of k receivers' errors in a step, and renewed shares (k, k), exact for any step."""
     fading = -dt_s / np.array(times_s)  # logarithms
     return np.exp(fading).repeat(2), tuple(map(tuple, (-np.expm1(np.add.outer(fading, fading))).tolist()))
 
 
 @lru_cache
 def _constants(layout: Layout, tuning: LocalisationTuning, *, on_plane: bool) -> tuple[Floats, Floats]:
-    """What every motion of a layout begins with.
-
-    Factor (n,) that sets the states off the plane to zero, and covariance (n, n) of the random walks of a second.
-    """
+    """Factor (n,) that zeroes states off the plane, and covariance (n, n) of one second's walks."""
     keep, deviation = np.ones(layout.n), np.zeros(layout.n)
     if on_plane:
         keep[OFF_PLANE] = 0.0

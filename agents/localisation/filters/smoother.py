@@ -1,21 +1,19 @@
-"""The fixed-lag smoother: what the present still says about the past (Anderson & Moore 1979, Optimal Filtering, 7.3).
+"""The fixed-lag smoother: what the present says of the past (Anderson & Moore 1979, Optimal Filtering, 7.3).
 
-A node is what the filter believed last in a second, of which only place and heading s = (x, y, yaw) are kept. For the
-lag it stays jointly Gaussian with the present state x: mean m (3,), covariance P_s (3, 3) and cross-covariance
-C = cov(s, x) (3, n). Whatever happens to the present is a linear map of its error, and noise that the past has no part
-in. With the symbols of the filters, F and H Jacobians (EKF) or what sigma points regress (UKF):
+A node is the last belief of a second, reduced to s = (x, y, yaw): mean m (3,), covariance P_s (3, 3), and
+cross-covariance C = cov(s, x) (3, n) with the present state x. Every step maps the present's error linearly and adds
+independent noise. F, H: Jacobians (EKF) or sigma-point regressions (UKF):
 
     motion, change of the state    C <- C F^T
     measurement                    m += C H^T S^-1 y      P_s -= C H^T S^-1 H C^T      C <- C (I - K H)^T
 
-All nodes go through the same maps. So these are collected first, at a cost that does not depend on the lag, and done to
-the nodes once a second:
+These maps are the same for all nodes: accumulated, at a cost independent of the lag, and applied once a second:
 
     Phi = product of F and I - K H    adjoint = sum of Phi^T H^T S^-1 y    information = sum of Phi^T H^T S^-1 H Phi
 
     m += C adjoint                    P_s -= C information C^T             C <- C Phi^T
 
-The sums are the adjoint variables of the modified Bryson-Frazier smoother (Bierman 1973).
+(Adjoint variables of the modified Bryson-Frazier smoother, Bierman 1973.)
 """
 
 from dataclasses import dataclass, replace
@@ -29,15 +27,15 @@ from protocol.rotations import wrap_angle
 
 NODE_NS = 1_000_000_000
 KEPT = [X, Y, YAW]
-MIN_VARIANCE = 1e-8  # along any axis [m2, rad2]: a tenth of a millimetre; rounding must not make a covariance negative
+MIN_VARIANCE = 1e-8  # floor along any axis [m2, rad2], 0.1 mm, against rounding
 
 
 @dataclass(frozen=True)
 class SmoothedPose:
-    """Where the machine was, as known after what came since: position [m], heading [rad, in +-pi], covariance (2, 2).
+    """A past pose given later measurements: position [m], heading [rad, in +-pi], covariance (2, 2).
 
-    correction: x, y [m] and heading [rad] (3,) less what the filter believed at that stamp. cross: (3, n), with the
-    state as it was known last. aid_share: how much of the position came from lanes, 0 to 1.
+    correction: x, y [m], heading [rad] (3,) less the filter's. cross: (3, n), with the last known state. aid_share:
+    from lanes, 0 to 1.
     """
 
     stamp_ns: int
@@ -51,10 +49,10 @@ class SmoothedPose:
 
 
 class Nodes(NamedTuple):
-    """Past places and headings [m, m, rad], oldest first; headings are not wrapped.
+    """Past places and headings [m, m, rad], oldest first, not wrapped.
 
-    stamp_ns: (q,). filtered: (q, 3), as the filter believed at their stamps. mean: (q, 3), covariance: (q, 3, 3), as
-    known by now. cross: (q, 3, n), with the state.
+    stamp_ns: (q,). filtered: (q, 3), as believed then. mean: (q, 3), covariance: (q, 3, 3), as known now. cross: (q, 3,
+    n), with the state.
     """
 
     stamp_ns: Ints
@@ -66,7 +64,7 @@ class Nodes(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Past:
-    """The nodes of the last lag_ns, and what happened to the state since they were brought up to date.
+    """Nodes of the last lag_ns, and the accumulated maps since their update.
 
     final: nodes that the last motion moved out of the lag. transition: Phi (n, n). adjoint: (n,). information: (n, n).
     """
@@ -79,7 +77,7 @@ class Past:
     information: Floats
 
     def advanced(self, stamp_ns: int, x: Floats, P: Floats, F: Floats, to_ns: int) -> "Past":
-        """After a motion F (n, n) from a belief x, P at stamp_ns, which becomes a node if its second is over."""
+        """After a motion F (n, n) from x, P at stamp_ns, a node if its second is over."""
         if to_ns // NODE_NS == stamp_ns // NODE_NS:
             return Past(self.lag_ns, self.nodes, (), F.dot(self.transition), self.adjoint, self.information)
         nodes = self.nodes_with(stamp_ns, x, P)
@@ -93,7 +91,7 @@ class Past:
         return replace(self, transition=M.dot(self.transition))
 
     def extended(self, more: int) -> "Past":
-        """With so many more states, of which the past knows nothing yet."""
+        """With `more` states, unknown to the past."""
         square, n = (0, more), len(self.adjoint)
         nodes = self.nodes._replace(cross=np.pad(self.nodes.cross, ((0, 0), (0, 0), square)))
         transition = np.eye(n + more)
@@ -102,7 +100,7 @@ class Past:
         return Past(self.lag_ns, nodes, self.final, transition, np.pad(self.adjoint, square), information)
 
     def informed(self, shown: Floats, weighted: Floats, y: Floats, K: Floats) -> "Past":
-        """After a measurement: shown: H Phi (k, n), weighted: its transpose times S^-1 (n, k); y: (k,), K: (n, k)."""
+        """After a measurement y (k,), gain K (n, k); shown: H Phi (k, n), weighted: its transpose times S^-1."""
         return Past(
             self.lag_ns,
             self.nodes,
@@ -113,13 +111,13 @@ class Past:
         )
 
     def poses(self, stamp_ns: int, x: Floats, P: Floats) -> list[SmoothedPose]:
-        """All nodes, as known by now, and the belief x, P at stamp_ns itself."""
+        """All nodes as known now, and the belief x, P."""
         return _poses(self.nodes_with(stamp_ns, x, P))
 
     def nodes_with(self, stamp_ns: int, x: Floats, P: Floats) -> Nodes:
-        """The nodes brought up to date, and the belief x, P at stamp_ns."""
+        """Updated nodes, and the belief x, P."""
         _, filtered, mean, covariance, cross = self.nodes
-        flat = cross.reshape(-1, len(x))  # one product for all nodes
+        flat = cross.reshape(-1, len(x))
         fell = flat.dot(self.information).reshape(cross.shape) @ cross.transpose(0, 2, 1)
         s, C = x[None, KEPT], P[None, KEPT]
         return Nodes(
@@ -132,7 +130,7 @@ class Past:
 
 
 def nothing_past(n: int, lag_s: float) -> Past | None:
-    """The past of a belief of n states that has none yet; None where nothing is to be smoothed."""
+    """The empty past of n states; None without smoothing."""
     if not lag_s:
         return None
     nodes = Nodes(np.zeros(0, np.int64), *(np.zeros((0, *shape)) for shape in ((3,), (3,), (3, 3), (3, n))))
@@ -140,7 +138,6 @@ def nothing_past(n: int, lag_s: float) -> Past | None:
 
 
 def _poses(nodes: Nodes, end: int | None = None) -> list[SmoothedPose]:
-    """Poses of the nodes, or of the oldest up to one."""
     rows = zip(*(values[:end] for values in nodes), strict=True)
     return [_pose(int(stamp_ns), *values) for stamp_ns, *values in rows]
 
@@ -151,7 +148,7 @@ def _pose(stamp_ns: int, filtered: Floats, mean: Floats, covariance: Floats, cro
 
 
 def _floored(covariance: Floats) -> Floats:
-    """The covariance, of which no eigenvalue is below MIN_VARIANCE."""
+    """The covariance with eigenvalues of at least MIN_VARIANCE."""
     values, vectors = np.linalg.eigh(covariance)
     if values[0] >= MIN_VARIANCE:
         return covariance

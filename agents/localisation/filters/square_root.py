@@ -1,12 +1,12 @@
-"""What EKF and UKF share: square roots of covariances that never fail, and the conditioning on a measurement.
+"""Shared by EKF and UKF: square roots of covariances that never fail, and conditioning.
 
-x: mean (n,), P = L L^T: its covariance (n, n) and lower Cholesky factor. z, R: measurement (k,) and covariance (k, k).
-y: innovation, S: its covariance (k, k), K: gain (n, k). Both filters describe what they expect by m deviations from the
-mean, Z (k, m) of the measurement together with X (n, m) of the state; noise deviates the measurement alone. Then
+x: mean (n,), P = L L^T: covariance (n, n), lower Cholesky factor. z, R: measurement (k,), covariance (k, k). y:
+innovation, S: its covariance (k, k), K: gain (n, k). Both filters give m deviations from the mean, Z (k, m) of the
+measurement and X (n, m) of the state; noise deviates Z alone:
 
     P = X X^T      S = Z Z^T      K = X Z^T S^-1
 
-On matrices this small `dot` takes half the time of `@`, and LAPACK itself a tenth of that of numpy.linalg.
+On small matrices `dot` takes half the time of `@`, and LAPACK itself a tenth of numpy.linalg's.
 """
 
 import math
@@ -18,15 +18,15 @@ from agents.localisation.filters.belief import Belief, Conditioned, Measurement,
 from agents.localisation.filters.smoother import Past
 from protocol.arrays import Floats
 
-MIN_VARIANCE = 1e-18  # of any state, in its unit squared
-MIN_EIGENVALUE = 1e-10  # of a repaired covariance, after scaling its diagonal to one
-MAX_INFLATION = 1e13  # variances over what of them the states before leave unexplained, summed
-UNKNOWN_ANGLE = (math.pi / 2) ** 2  # variance [rad2]: a right angle is as good as nothing known
+MIN_VARIANCE = 1e-18  # variance floor of any state, in its unit squared
+MIN_EIGENVALUE = 1e-10  # eigenvalue floor of a repaired covariance with unit diagonal
+MAX_INFLATION = 1e13  # upper bound of the sum of variance over unexplained variance
+UNKNOWN_ANGLE = (math.pi / 2) ** 2  # variance [rad2] of a right angle, as good as unknown
 TAU = 2 * math.pi
 
 
 def wrapped(values: Floats, angles: tuple[int, ...]) -> Floats:
-    """The same values (n,) or (m, n), of which those that are angles are brought into +-pi [rad]."""
+    """Values (n,) or (m, n) with angles wrapped to +-pi [rad]."""
     if not angles:
         return values
     values = values.copy()
@@ -44,7 +44,7 @@ def wrapped_state(x: Floats, angles: tuple[int, ...]) -> Floats:
 
 
 def factor(P: Floats) -> Floats:
-    """Lower Cholesky factor of a covariance, or of the nearest one that is positive definite."""
+    """Lower Cholesky factor of a covariance, repaired if necessary."""
     L, failed = _cholesky(P)
     return _cholesky(_repaired(P))[0] if failed else L
 
@@ -55,7 +55,7 @@ def root(belief: Belief) -> Floats:
 
 
 def definite(stamp_ns: int, x: Floats, P: Floats, past: Past | None = None) -> Belief:
-    """A belief of that covariance where it is positive definite by some margin, else of one nearby that is."""
+    """A belief of this covariance, repaired if it is not safely positive definite."""
     L, failed = _cholesky(P)
     pivots = L.diagonal()
     if failed or P.diagonal().dot(np.reciprocal(pivots * pivots)) > MAX_INFLATION:
@@ -65,11 +65,10 @@ def definite(stamp_ns: int, x: Floats, P: Floats, past: Past | None = None) -> B
 
 
 def conclude_motion(belief: Belief, motion: Motion, stamp_ns: int, x: Floats, P: Floats, F: Floats | None) -> Belief:
-    """The belief after a motion to x, P. F (n, n): what it did to the state's error, None of a belief without a past.
+    """The belief after a motion to x, P. F (n, n): map of the state's error, None without a past.
 
-    No angle is less known than to a right angle. Without that the attitude of a machine whose tilt nobody measures is
-    taken for linear over many turns, and the covariance of all else grows without end; and sigma points sqrt(3)
-    deviations off would meet behind the back. Rows and columns are scaled, so what is definite stays so.
+    Angle variances stop at a right angle. Else an unmeasured tilt counts as linear over many turns, covariances grow
+    without bound, and sigma points meet behind the back. Scaling rows and columns keeps it definite.
     """
     variance = P.diagonal()
     wide = [i for i in motion.angles if variance[i] > UNKNOWN_ANGLE]
@@ -85,7 +84,7 @@ def conclude_motion(belief: Belief, motion: Motion, stamp_ns: int, x: Floats, P:
 
 
 def noise_root(measurement: Measurement) -> Floats | None:
-    """Lower factor of R, of which the lower triangle counts; None unless R is finite and definite."""
+    """Lower factor of R (lower triangle); None unless finite and definite."""
     R = measurement.R.ravel()
     if not math.isfinite(R.dot(R)):  # half the cost of isfinite().all()
         return None
@@ -94,7 +93,7 @@ def noise_root(measurement: Measurement) -> Floats | None:
 
 
 def refused(belief: Belief, measurement: Measurement) -> Conditioned:
-    """The belief as it was, and no innovation that could be computed."""
+    """The unchanged belief without an innovation."""
     k = len(measurement.z)
     return Conditioned(belief, np.full(k, np.nan), np.full((k, k), np.nan), math.nan, accepted=False)
 
@@ -102,13 +101,11 @@ def refused(belief: Belief, measurement: Measurement) -> Conditioned:
 def conclude(
     belief: Belief, measurement: Measurement, predicted: Floats, together: Floats, H: Floats | None
 ) -> Conditioned:
-    """Gate the innovation, and condition the belief on it.
+    """Gate the innovation, and condition the belief.
 
-    predicted: (k,). together: Z over X (k + n, m). H (k, n): how the measurement shows the state's error, None of a
-    belief without a past. The covariance is the square of what the measurement leaves of the
-    deviations, X - K Z: where the measurement is linear that is (I - K H) P (I - K H)^T + K R K^T (Joseph 1964). A sum
-    of squares stays symmetric, and definite but for rounding; it holds for any gain K, so also for one that is zero for
-    states that are only considered.
+    predicted: (k,). together: Z over X (k + n, m). H (k, n): measurement Jacobian, None without a past. The posterior
+    covariance is the square of X - K Z; for a linear measurement (I - K H) P (I - K H)^T + K R K^T (Joseph 1964).
+    Squares stay symmetric and definite for any gain K, also zero for considered states.
     """
     y = wrapped(measurement.z - predicted, measurement.angles)
     if not math.isfinite(y.dot(y)):
@@ -125,7 +122,7 @@ def conclude(
     if past is not None and H is not None:
         shown = H.dot(past.transition)
         past = past.informed(shown, _divided(shown.T, S), y, K)
-    if measurement.considers:  # the past learns all the same
+    if measurement.considers:  # the past still learns
         K = K.copy()
         K[list(measurement.considers)] = 0.0
     left = X - K.dot(Z)
@@ -134,7 +131,7 @@ def conclude(
 
 
 def _divided(rows: Floats, S: Floats) -> Floats:
-    """Rows (m, k) times S^-1, of S itself or of the nearest covariance that is positive definite."""
+    """Rows (m, k) times S^-1, S repaired if necessary."""
     _, solved, failed = dposv(S, rows.T, lower=1)
     if failed:
         _, solved, _ = dposv(_repaired(S), rows.T, lower=1)
@@ -143,14 +140,14 @@ def _divided(rows: Floats, S: Floats) -> Floats:
 
 
 def _cholesky(P: Floats) -> tuple[Floats, bool]:
-    """Lower factor, and whether there is none. LAPACK lets NaN pass: it ends up on the last diagonal element."""
+    """Lower factor, and whether it failed. LAPACK passes NaN on to the last diagonal element."""
     L: Floats
     L, info = dpotrf(P, lower=1)
     return L, info != 0 or not math.isfinite(L[-1, -1])
 
 
 def _repaired(P: Floats) -> Floats:
-    """Raise the eigenvalues to a floor, scaled so that metres and biases count alike; a belief of NaN is an error."""
+    """Raise eigenvalues to a floor, scaled to unit diagonal; ValueError for NaN."""
     if not np.isfinite(P).all():
         raise ValueError("the covariance is not finite")
     scale = np.sqrt(np.maximum(np.diag(P), MIN_VARIANCE))

@@ -1,7 +1,7 @@
-"""The state: the 15 of robot_localization, followed by the slow errors of sensors and of the map estimated with it.
+"""The state: the 15 of robot_localization, then slow errors of sensors and map.
 
-Frames as in REP-103 and REP-105: `map` is east, north, up; `base_link` is forward, left, up.
-map_from_base = Rz(yaw) Ry(pitch) Rx(roll).
+Frames (REP-103, REP-105): `map` is east, north, up; `base_link` forward, left, up. map_from_base = Rz(yaw) Ry(pitch)
+Rx(roll).
 """
 
 from dataclasses import dataclass
@@ -16,19 +16,17 @@ X, Y, Z, ROLL, PITCH, YAW, SPEED = range(7)  # SPEED: forward
 YAW_RATE = 11
 BASE_STATES = 15
 ANGLES = (ROLL, PITCH, YAW)
-# Zero for a machine on a plane: height, tilt, and what changes them (two_d_mode of robot_localization).
+# Zero on a plane: height, tilt, and their rates (two_d_mode of robot_localization).
 OFF_PLANE = [Z, ROLL, PITCH, 8, 9, 10, 14]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where in the state each error stands: of the turn rate, then of wheels, GPS receivers and heading references.
+    """Position of each error in the state, in this order.
 
-    imus: with a yaw gyro bias each [rad/s], and one more where another sensor shows the turn. wheel_scale: whether
-    there is one [-]: wheels turn by 1 + scale times the distance. receivers: GPS receivers with an error east and north
-    each [m]. references: of attitude, with an error of the heading each [rad]. lanes: whether those of all machines are
-    compared with, of which the map's offset and this machine's own habit are states. Without any, the 15 states of the
-    paper.
+    imus: a yaw gyro bias each [rad/s], and one for another turn sensor. wheel_scale [-]: wheels turn by 1 + scale times
+    the distance. receivers: a GPS error each, east and north [m]. references: a heading error each [rad]. lanes: map
+    offset and lateral habit. None of them: the paper's 15 states.
     """
 
     imus: int = 0
@@ -53,7 +51,7 @@ class Layout:
 
     @cached_property
     def wheel_scales(self) -> slice:
-        """The one wheel scale [-], or none."""
+        """One wheel scale [-], or none."""
         first = self.gyro_biases.stop
         return slice(first, first + self.wheel_scale)
 
@@ -71,24 +69,24 @@ class Layout:
 
     @cached_property
     def map_offset(self) -> slice:
-        """Offset of the map, east and north [m]; none without lanes."""
+        """Map offset, east and north [m]; none without lanes."""
         first = self.heading_errors.stop
         return slice(first, first + 2 * self.lanes)
 
     @cached_property
     def beside_lane(self) -> slice:
-        """How far to the left of the fleet's lanes the machine keeps [m]; none without lanes."""
+        """Offset to the left of the fleet's lanes [m]; none without lanes."""
         first = self.map_offset.stop
         return slice(first, first + self.lanes)
 
     def gyro_bias(self, imu: int) -> int:
-        """State of the bias of one yaw gyro."""
+        """State of one yaw gyro's bias."""
         if not 0 <= imu < self.imus:
             raise IndexError(f"no IMU {imu} among {self.imus}")
         return BASE_STATES + imu
 
     def gps_error(self, receiver: int) -> slice:
-        """States of the error of one receiver: east, north."""
+        """States of one receiver's error: east, north."""
         if not 0 <= receiver < self.receivers:
             raise IndexError(f"no receiver {receiver} among {self.receivers}")
         first = self.gps_errors.start + 2 * receiver

@@ -1,11 +1,9 @@
-"""The filters of the profile `paper`: filterpy's own UnscentedKalmanFilter and ExtendedKalmanFilter, as they are.
+"""Filters of the profile `paper`: filterpy's own UnscentedKalmanFilter and ExtendedKalmanFilter.
 
-The paper's method runs on the field's textbook library, as its readers would build it; the square-root filters beside
-it (`ekf.py`, `ukf.py`) are those of the profile `default`. What filterpy leaves to its users is added: models, wrapped
-angles, gates, and sigma points drawn again before each measurement, since its `update` reuses those of `predict`.
-
-With the paper's lambda = 3 - n the weight of the central point is negative, and P - K S K^T is a difference: what comes
-out may be no covariance. Then nothing is left to go on with, and `DivergedError` says so.
+The paper's method runs on the field's textbook library; `ekf.py` and `ukf.py` serve the profile `default`. Added is
+what filterpy leaves to users: models, wrapped angles, gates, and new sigma points before each measurement, as its
+`update` reuses those of `predict`. With the paper's lambda = 3 - n the central weight is negative, so the result may be
+no covariance: `DivergedError`.
 """
 
 import math
@@ -19,14 +17,14 @@ from agents.localisation.filters.belief import Belief, Conditioned, DivergedErro
 from agents.localisation.filters.square_root import noise_root, refused, wrapped, wrapped_state
 from protocol.arrays import Floats
 
-ALPHA, BETA = 1.0, 1.0  # with kappa = 3 - n the paper's lambda, and the weights of `Ukf`
+ALPHA, BETA = 1.0, 1.0  # with kappa = 3 - n, the paper's lambda and the weights of `Ukf`
 
 
 class TextbookEkf:
     """filterpy's ExtendedKalmanFilter."""
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
-        """Move the belief: x <- f(x), P <- F P F^T + Q."""
+        """Predict: x <- f(x), P <- F P F^T + Q."""
         stock = _ekf(belief, 1)
         stock.Q, stock.F = motion.Q, motion.jacobian(belief.x)
         stock.predict()
@@ -34,7 +32,7 @@ class TextbookEkf:
         return _believed(stamp_ns, wrapped_state(x, motion.angles), stock.P)
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
-        """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
+        """Condition; the prior if unusable or gated."""
         if not _is_usable(measurement):
             return refused(belief, measurement)
         stock = _ekf(belief, len(measurement.z))
@@ -51,17 +49,17 @@ class TextbookUkf:
     """filterpy's UnscentedKalmanFilter with van der Merwe's scaled sigma points."""
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
-        """Move the belief through the motion."""
+        """Move the belief."""
         stock = _ukf(belief, 1)
         stock.Q, stock.fx = motion.Q, lambda x, _: motion.f(x[None])[0]
         try:
-            stock.predict()  # it draws points of the prediction too
+            stock.predict()  # also draws points of the prediction
         except ValueError:  # LinAlgError is one
             raise DivergedError("the covariance is not positive definite") from None
         return _believed(stamp_ns, wrapped_state(stock.x, motion.angles), stock.P)
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
-        """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
+        """Condition; the prior if unusable or gated."""
         if not _is_usable(measurement):
             return refused(belief, measurement)
         stock = _ukf(belief, len(measurement.z))
@@ -97,20 +95,19 @@ def _difference(a: Floats, b: Floats, angles: tuple[int, ...]) -> Floats:
 
 
 def _mean(points: Floats, weights: Floats, angles: tuple[int, ...]) -> Floats:
-    """Mean (k,) of points (m, k), whose deviations from the central one are wrapped where they are angles."""
+    """Mean (k,) of points (m, k), with wrapped deviations of angles from the central one."""
     mean: Floats = points[0] + weights.dot(wrapped(points - points[0], angles))
     return mean
 
 
 def _believed(stamp_ns: int, x: Floats, P: Floats) -> Belief:
-    """What came out, where it is a mean and may be a covariance; whether it is definite shows when it is factored."""
+    """The result, if finite with positive variances; factoring shows whether it is definite."""
     if not (math.isfinite(x.dot(x)) and np.isfinite(P).all() and P.diagonal().min() > 0):
         raise DivergedError("a variance is not positive")
     return Belief(stamp_ns, x, P)
 
 
 def _concluded(belief: Belief, measurement: Measurement, stock: Any) -> Conditioned:
-    """What a filter made of a measurement, unless it is beyond its gate."""
     nis = float(stock.y.dot(stock.SI).dot(stock.y))
     if not math.isfinite(nis) or nis < 0:
         raise DivergedError("the innovation covariance is not positive definite")

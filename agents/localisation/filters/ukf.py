@@ -1,20 +1,17 @@
-"""The unscented Kalman filter, all sigma points at once, in a form whose covariance cannot go negative.
+"""The unscented Kalman filter, vectorised, in a form whose covariance cannot become negative.
 
-Each step draws its own sigma points. filterpy's filter (`textbook.py`), whose covariance can go negative, takes the
-same steps to 1e-9. x, P = L L^T: belief, L_i: column of the factor, Q, R: noise.
+filterpy's filter (`textbook.py`) agrees to 1e-9 per step, but can turn negative. x, P = L L^T: belief, L_i: column of
+the factor, Q, R: noise.
 
-The scaled unscented transform (van der Merwe 2004) takes a function g at x and at the sigma points x +- gamma L_i, with
-gamma^2 = alpha^2 (n + kappa). Put into the usual sums, the weights (W = 1 / (2 gamma^2), and large ones of either sign
-at the centre) cancel on paper: with d_j = g(x_j) - g(x), of the 2 n points around the centre,
+The scaled unscented transform (van der Merwe 2004) evaluates g at x and at x +- gamma L_i, gamma^2 = alpha^2 (n +
+kappa). Weights are W = 1 / (2 gamma^2), and large central ones that cancel: with d_j = g(x_j) - g(x) of the 2 n outer
+points,
 
     mean = g(x) + m,  m = W sum(d_j)       covariance = W sum(d_j d_j^T) + (beta - alpha^2) m m^T
 
-which is a sum of squares if beta >= alpha^2, whatever the sign of the centre's weight: the paper's lambda = 3 - n, and
-alpha = 0.001, are safe in this form. The default is the paper's gamma^2 = 3, which is right to the fourth moment along
-each axis, with beta = alpha^2, where the last term, which grows with n, vanishes.
-
-The d_j are columns of d. That of the centre, which does not deviate from itself, takes sqrt((beta - alpha^2) / W) m, so
-that the covariance is W d d^T.
+a sum of squares if beta >= alpha^2, so the paper's lambda = 3 - n and alpha = 0.001 are safe. The default, the paper's
+gamma^2 = 3, is exact to the fourth moment along each axis; beta = alpha^2 removes the last term, which grows with n. In
+d, the central column is sqrt((beta - alpha^2) / W) m, so the covariance is W d d^T.
 """
 
 import math
@@ -32,9 +29,9 @@ from protocol.arrays import Floats
 
 @dataclass(frozen=True)
 class Ukf:
-    """Sees motion and measurement at points around the mean.
+    """Evaluates models at points around the mean.
 
-    alpha, beta, kappa: of the scaled unscented transform, kappa None for 3 - n. beta must not be below alpha^2.
+    alpha, beta, kappa: of the scaled unscented transform; kappa None means 3 - n; beta at least alpha^2.
     """
 
     alpha: float = 1.0
@@ -50,7 +47,7 @@ class Ukf:
             raise ValueError("kappa: must be finite")
 
     def predict(self, belief: Belief, motion: Motion, stamp_ns: int) -> Belief:
-        """Move the belief through the motion."""
+        """Move the belief."""
         points = self._points(len(belief.x), 0)
         _, d, mean = points.deviations(belief, motion.f, ())
         P = points.W * d.dot(d.T) + motion.Q  # with beta = alpha^2 around the centre
@@ -59,7 +56,7 @@ class Ukf:
         return conclude_motion(belief, motion, stamp_ns, mean, P, points.slope(d, belief))
 
     def condition(self, belief: Belief, measurement: Measurement) -> Conditioned:
-        """Condition the belief on a measurement; the prior unchanged where it is unusable or beyond its gate."""
+        """Condition; the prior if unusable or gated."""
         noise = noise_root(measurement)
         if noise is None:
             return refused(belief, measurement)
@@ -78,7 +75,7 @@ class Ukf:
 
 
 class SigmaPoints:
-    """Where n states are sampled, and how the samples are weighted, for a measurement of k. It holds no belief."""
+    """Points and weights for n states and a measurement of k."""
 
     def __init__(self, n: int, k: int, alpha: float, beta: float, kappa: float) -> None:
         if n + kappa <= 0:
@@ -86,7 +83,7 @@ class SigmaPoints:
         self.gamma = alpha * math.sqrt(n + kappa)
         self.W, self.root_W = 0.5 / self.gamma**2, math.sqrt(0.5) / self.gamma
         self.surplus = beta - alpha**2
-        # Of x, in units of L: the centre, the pairs around it, and k times the centre, where noise deviates.
+        # In units of L: centre, pairs, and k times the centre, where noise deviates.
         directions = np.concatenate([np.zeros((n, 1)), np.eye(n), -np.eye(n), np.zeros((n, k))], axis=1)
         self.directions = self.gamma * directions
         self.weights = np.full(2 * n + 1 + k, self.W)
@@ -94,7 +91,7 @@ class SigmaPoints:
     def deviations(
         self, belief: Belief, g: Callable[[Floats], Floats], angles: tuple[int, ...]
     ) -> tuple[Floats, Floats, Floats]:
-        """Those of x (n, 2 n + 1 + k) and d of g (j, 2 n + 1 + k) at the points, and the mean (j,) of g."""
+        """Deviations of x (n, 2 n + 1 + k) and d of g (j, 2 n + 1 + k), and the mean (j,) of g."""
         of_x = root(belief).dot(self.directions)
         values = g((of_x + belief.x[:, None]).T)
         centre = values[0]
@@ -105,10 +102,10 @@ class SigmaPoints:
         return of_x, d, centre + m
 
     def slope(self, d: Floats, belief: Belief) -> Floats | None:
-        """The linear map (j, n) that regresses d of g on the state; None of a belief without a past.
+        """Linear regression (j, n) of d of g on the state; None without a past.
 
-        The cross-covariance of g and x times P^-1 (statistical linearisation): for g' = (d_+ - d_-) / (2 gamma), its
-        deviations along the columns of L, that is g' L^-1. By the BLAS, as LAPACK's dtrtrs starts threads for it.
+        Statistical linearisation: g' L^-1 with g' = (d_+ - d_-) / (2 gamma) along the columns of L. By BLAS, as
+        LAPACK's dtrtrs starts threads.
         """
         if belief.past is None:
             return None
