@@ -28,8 +28,8 @@ from protocol.wire.owners import ANSWER_S, EVERY_OTHER, Owner, decode_owner, enc
 
 ROUNDS = 2  # rounds without an answer; the first after a reconnection may reach nobody (Zenoh issue 2767)
 BETWEEN_S = 0.25
-WATCH_S = 1.0  # between a writer's questions
-TAKE_OVER_S = 60.0  # for the other server to commit, write its snapshot and end
+WATCH_S = 1.0  # interval of a writer's questions
+TAKE_OVER_S = 60.0  # time for the other server to commit, write its snapshot and end
 _TWO = "two databases have this journal: a restored copy or an old primary has to go"
 log = logging.getLogger("mapserver.claim")
 

@@ -29,9 +29,9 @@ UNKNOWN_SHARE = 0.5  # relative deviation of the price of unknown ground
 UNKNOWN_SLOPE_STD = 0.05  # deviation of unknown slopes [m/m], as even as known ground permits
 # unevenness that machines bridge and sensors' lag [m/m]; machines' pitch on slopes, relative
 UNEVEN_STD, SLOPE_SHARE = 0.0045, 0.05
-RESISTANCE_PRIOR_STD = 1.3  # of log(c_rr): uniform from 0.004 to 0.4 (log 100 / sqrt 12)
-GRADE_PRIOR_STD = 0.1  # of a gradient component of any ground [m/m]
-MACHINE_SHARE = 0.5  # of a sample's stated variance, from its machine's bias and scale, the same in all passes
+RESISTANCE_PRIOR_STD = 1.3  # deviation of log(c_rr), uniform from 0.004 to 0.4 (log 100 / sqrt 12)
+GRADE_PRIOR_STD = 0.1  # deviation of a gradient component of any ground [m/m]
+MACHINE_SHARE = 0.5  # share of a sample's stated variance that all passes of its machine have in common: bias and scale
 NINETY = 1.645  # standard deviations on each side of a 90 % interval
 
 

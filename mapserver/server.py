@@ -37,8 +37,8 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_reply
 from protocol.wire.messages import Ack, Refused
 
-COMMAND_THREADS = 8  # a command waits for its map; others are stored meanwhile, and folded together
-MOST_COMMANDS = 16  # waiting or in work
+COMMAND_THREADS = 8  # threads: a command waits for its map; others are stored meanwhile, and folded together
+MOST_COMMANDS = 16  # waiting and running commands
 SignReply = Callable[[str, bytes, bytes], bytes]  # arguments: key expression, batch, reply to sign
 log = logging.getLogger("mapserver")
 

@@ -33,7 +33,7 @@ from protocol.arrays import Floats, Table
 from protocol.machine.samples import SCALE_STD
 from protocol.site.site_config import KnownGround
 
-KNOWN = CommonScale(True, 0.0, "")  # of machines solved together
+KNOWN = CommonScale(True, 0.0, "")  # common scale of machines solved together
 # Beyond half to twice the drive force there is no gain: the sensor is stuck or upside down.
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
 # Newest epochs and machines per solve: time grows with the cube and memory with the square of unknowns (100 machines: 6

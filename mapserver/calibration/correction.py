@@ -30,7 +30,7 @@ from protocol.arrays import Floats, Ints, Table
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.machine.samples import LIMITS
 
-HEADINGS = 4096  # of the table: 0.8e-3 rad off, 0.2e-3 of lateral slope on 15 degrees
+HEADINGS = 4096  # rows of the table: 0.8e-3 rad off, 0.2e-3 of lateral slope on 15 degrees
 _UNIT = 1 << 20  # sines are rounded to 1 / _UNIT, as libraries differ in their last bits
 _TURNS = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)
 HEADING_TABLE: Ints = np.rint(_UNIT * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1)).astype(np.int64)

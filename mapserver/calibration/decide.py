@@ -32,15 +32,15 @@ from mapserver.calibration.select import FAULT_SIGMAS, state_of
 from mapserver.calibration.tuning import TUNING
 from protocol.units import HOUR_NS, MINUTE_NS
 
-# Between the solver's decisions, each of which folds samples again; a new machine has few, and decides again whenever
+# Interval of the solver's decisions, each of which folds samples again; a new machine has few, and decides whenever
 # its driving time has doubled.
 EVERY_NS = 10 * MINUTE_NS
-IN_A_ROW = 2  # differing solves; one for a new machine without corrections
+IN_A_ROW = 2  # differing solves needed; one for a new machine without corrections
 LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # smaller differences do not improve maps
-LEAST_ROLLS, TYPICAL_C_RR = 0.04, 0.04  # of rolling (two deviations at best), at this c_rr
+LEAST_ROLLS, TYPICAL_C_RR = 0.04, 0.04  # least change of rolling (two deviations at best), at this c_rr
 FIRST_NS = 10 * MINUTE_NS  # age of a machine up to which its map is new
 FROZEN_NS = 4 * HOUR_NS  # age of an epoch at which its bias is final
-MOST_STEP_NS = 10 * MINUTE_NS  # between judgements; longer jumps come from wrong clocks or nights
+MOST_STEP_NS = 10 * MINUTE_NS  # longest step between judgements; more is a wrong clock or a night
 
 
 class CalibrationDecisions:

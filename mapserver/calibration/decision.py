@@ -13,9 +13,9 @@ from mapserver.calibration.select import MachineErrors
 from protocol.queries.calibration import CorrectedSpan, MachineCalibration
 from protocol.queries.commands import CalibrateCommand
 
-KIND = "calibration"  # of the event
+KIND = "calibration"  # event kind
 SOLVER, PERSON = "solver", "person"
-MOST_SPANS = 100  # of an answer: a machine's last day
+MOST_SPANS = 100  # spans per answer: a machine's last day
 
 
 @dataclass(frozen=True)

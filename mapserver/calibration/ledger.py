@@ -15,11 +15,11 @@ from mapserver.calibration.stays import SLOT_NS, SLOT_SHIFT, STAY, VALUE_UNITS, 
 from protocol.arrays import Ints, Table
 from protocol.machine.samples import APPLIED, SAMPLE_DTYPE
 
-CELL_M = 2.0  # metres, one deviation of a position: finer cells would compare single samples
-EPOCH_SLOTS = 30  # 300 s, the map's time bucket
+CELL_M = 2.0  # cell edge [m], one deviation of a position: finer cells would compare single samples
+EPOCH_SLOTS = 30  # slots per epoch: 300 s, the map's time bucket
 EPOCH_NS = EPOCH_SLOTS * SLOT_NS
-EPOCHS = 48  # kept, 4 h of driving; older corrections stay as decided
-PENDING_ROWS = 4096  # merged at once, because merging sorts everything
+EPOCHS = 48  # epochs kept, 4 h of driving; older corrections stay as decided
+PENDING_ROWS = 4096  # stays merged at once, because merging sorts everything
 
 
 class StayLedger:

@@ -15,7 +15,7 @@ from mapserver.calibration import stays as st
 from mapserver.calibration.ledger import CELL_M, EPOCH_SLOTS
 from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
 
-MOST_SAMPLES = 4000  # of a stay: no machine takes more in 10 s, and larger sums overflowed
+MOST_SAMPLES = 4000  # samples per stay: no machine takes more in 10 s, and larger sums overflowed
 MAX_PAUSE_S = 15.0  # a longer pause interrupts the sequence
 GAP_M = 1.5  # metres between stays without samples, of unknown slope
 JUMP_M = 2.0  # metres between positions and odometry, plus half the distance

@@ -24,7 +24,7 @@ from protocol.arrays import Floats, Ints
 from protocol.machine.samples import SCALE_STD
 from protocol.units import GRAVITY_MPS2
 
-MET_EPOCHS = 2  # in which a machine must meet others; one may be rain
+MET_EPOCHS = 2  # epochs in which a machine must meet others; one may be rain
 ROUNDS = 5  # reweighting rounds
 
 

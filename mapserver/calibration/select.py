@@ -19,14 +19,14 @@ from mapserver.calibration.solver import Estimate, FleetProblem, Prior, inverse
 from protocol.arrays import Bools, Floats, Ints
 from protocol.machine.samples import SCALE_STD, ZERO_STD
 
-WEAK = 0.01  # of the data sheet's weight: evidence must be enough
-REMEMBERED = "remembered"  # shown by an earlier solve
-# named alone beside the shared ground
+WEAK = 0.01  # remaining weight of a data sheet: evidence must be enough
+REMEMBERED = "remembered"  # name of earlier evidence as a source
+# sources named alone beside the shared ground
 NAMED = (src.SAME_GROUND, src.CROSSINGS, src.HEIGHTS, src.EDGES, src.KNOWN_GROUND)
-SURE = 2.0  # standard deviations beyond a limit
-# Of a remembered scale: temperature, tyres and oil change it by this. Small enough to count until contradicted.
+SURE = 2.0  # standard deviations that make a deviation certain
+# Deviation of a remembered scale: temperature, tyres and oil change it so far. It counts until contradicted.
 REMEMBERED_STD = 0.02
-FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # of the data sheet: a bias, and a scale of 30 %, that no sound sensor has
+FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # data-sheet sigmas of a bias, and of a scale of 30 %, that no sound sensor has
 
 
 @dataclass(frozen=True)

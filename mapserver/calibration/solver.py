@@ -26,7 +26,7 @@ from protocol.site.site_config import KnownGround
 
 ZERO_S = 2 * ZERO_STD**2 / ZERO_WALK**2  # seconds; with this walk a Gauss-Markov process stays within the data sheet
 MOST_ROUNDS = 20
-SETTLED = 2e-6  # of any parameter: below the rounding of corrections
+SETTLED = 2e-6  # largest change of a parameter, below the rounding of corrections
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from protocol.arrays import AnyArray, Floats, Ints
 SAME_GROUND, CROSSINGS, HEIGHTS, EDGES, KNOWN_GROUND = "same_ground", "crossings", "heights", "edges", "known_ground"
 
 LEAST_C_RR = 0.002  # lower bound of c_rr in the share of drive force
-SECTORS = 8  # of headings
+SECTORS = 8  # headings per turn
 EDGE_SECTORS = 4
 
 

@@ -16,12 +16,12 @@ from protocol.arrays import Ints, Table
 from protocol.machine.samples import APPLIED
 
 SLOT_NS = 10_000_000_000
-VALUE_UNITS = 100_000  # per unit of c_rr or slope
-PLACE_UNITS = 1000  # per metre or second
-_AXIS_BITS = 16  # of columns and rows: 131 km of 2 m cells
+VALUE_UNITS = 100_000  # units per unit of c_rr or slope
+PLACE_UNITS = 1000  # units per metre or second
+_AXIS_BITS = 16  # bits of columns and rows: 131 km of 2 m cells
 _HALF = 1 << (_AXIS_BITS - 1)
 SLOT_SHIFT = 2 * _AXIS_BITS + 1
-_HEADING_SHIFT = 6  # of the heading table's integers: sums of 16 000 samples fit
+_HEADING_SHIFT = 6  # shift of the heading table's integers, so that sums of 16 000 samples fit
 HEADING_UNITS = 1 << (20 - _HEADING_SHIFT)
 
 # n samples, `known` with c_rr. Sums: ms in the slot; mm in the cell; c_rr and gradient in VALUE_UNITS; heading in

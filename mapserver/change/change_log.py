@@ -25,8 +25,8 @@ from protocol.queries.answers import GroundChange
 from protocol.site.geometry import BLOCK_CELLS
 from protocol.units import HOUR_NS
 
-KIND = "change"  # of the journal's events
-SAME_NS = 6 * HOUR_NS  # within this time, adjacent changes are one
+KIND = "change"  # kind of the journal's events
+SAME_NS = 6 * HOUR_NS  # span within which adjacent changes are one
 # tolerance of a change's time, besides the length of its pages, which grows as they are summed
 SETTLES_NS = 2 * HOUR_NS
 NEAR_CELLS = 8.0

@@ -12,7 +12,7 @@ import numpy as np
 
 from mapserver.evidence.cells import CELLS
 
-LEAST = 1e-9  # instead of a division by 0
+LEAST = 1e-9  # lower bound of divisors
 
 
 @numba.njit(cache=True, nogil=True)

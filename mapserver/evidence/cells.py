@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-SCHEMA = 6  # of all below; other snapshots are folded again
+SCHEMA = 6  # number of the format below; other snapshots are folded again
 
-CELLS = BLOCK_CELLS * BLOCK_CELLS  # per block
+CELLS = BLOCK_CELLS * BLOCK_CELLS  # cells per block
 WEIGHT_UNITS_PER_M = 4096
 COUNT_MAX = np.iinfo(np.uint32).max
 
@@ -26,7 +26,7 @@ RESISTANCE_CENTRES = np.geomspace(0.004, 0.4, RESISTANCE_BINS)
 # Gradient bins, every 1/32 over +-0.5 [m/m].
 GRADE_BINS = 33
 GRADE_CENTRES = np.linspace(-0.5, 0.5, GRADE_BINS)
-SECTORS = 16  # of heading, the first centred on east
+SECTORS = 16  # headings per turn, the first centred on east
 
 RESISTANCE = slice(0, RESISTANCE_BINS)
 GRADE_EAST = slice(RESISTANCE.stop, RESISTANCE.stop + GRADE_BINS)
@@ -34,11 +34,11 @@ GRADE_NORTH = slice(GRADE_EAST.stop, GRADE_EAST.stop + GRADE_BINS)
 HEADING = slice(GRADE_NORTH.stop, GRADE_NORTH.stop + SECTORS)
 # metres of c_rr votes, times stated deviation over DOUBT_MOST
 DOUBT = HEADING.stop
-DOUBT_MOST = 0.032  # upper bound [-]: three of it are half of sand's contrast to concrete
+DOUBT_MOST = 0.032  # largest deviation that counts [-]: three are half of sand's contrast to concrete
 AIDED = DOUBT + 1  # metres, times the position's share from lanes
 COUNTS = AIDED + 1
 
-VISITS, MACHINES = 0, 1  # the bitmaps
+VISITS, MACHINES = 0, 1  # indices of the bitmaps
 SHARE_ONE = 256  # a vote is split between two bins in 1/256
 
 

@@ -32,8 +32,7 @@ RESISTANCE_STEPS: Floats = np.geomspace(
 GRADE_LOW = float(ev.GRADE_CENTRES[0])
 GRADE_STEPS = (ev.GRADE_BINS - 1) * ev.SHARE_ONE / float(ev.GRADE_CENTRES[-1] - ev.GRADE_CENTRES[0])
 
-# Added to positions' deviations, in squares: errors last for minutes, unlike a covariance's. More blurs roads of two
-# cells.
+# Floor added to positions' deviations in squares, because errors last for minutes. More would blur roads of two cells.
 STD_FLOOR_M = 0.3
 WEIGHT_SHIFT = 32  # shares are exact to 2**-32 before rounding down
 

@@ -25,7 +25,7 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 # refolding, only the total counts. Per worker.
 LIVE_ROWS, REFOLD_ROWS = 8192, 131_072
 PIECE = 4096  # samples that stay far below COUNT_MAX in total
-READ_BLOCKS = 32  # summed at once: 7 MB, within the processor's cache
+READ_BLOCKS = 32  # blocks summed at once: 7 MB, within the processor's cache
 
 
 class Grid:

@@ -18,12 +18,12 @@ from mapserver.evidence.record_writing import write_records
 from protocol.arrays import AnyArray, Ints, Table
 
 # place: bin * 256 + cell. If a count exceeds 16 bits, all of the block are wide.
-TIERS = 4  # of a timeline: buckets, hours, days, all before
+TIERS = 4  # tiers of a timeline: buckets, hours, days, all before
 NARROW = np.dtype([("place", "<u2"), ("count", "<u2")])
 WIDE = np.dtype([("place", "<u2"), ("count", "<u4")])
 CELL = np.dtype([("cell", "u1"), ("visits", "<u8"), ("machines", "<u8"), ("newest_ns", "<i8")])
 Record = bytes  # of a block; layout in record_kernels.py
-_PAGES, _MARKS, _VOTES = 0, 1, 3  # in its header
+_PAGES, _MARKS, _VOTES = 0, 1, 3  # indices in a record's header
 _KNOWN = slice(record_kernels.FIELDS * 4, record_kernels.HEADER_BYTES)
 
 

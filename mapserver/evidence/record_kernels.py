@@ -22,7 +22,7 @@ import numpy as np
 
 from mapserver.evidence.cells import CELLS, COUNTS
 
-FIELDS = 6  # of the header, before the bits
+FIELDS = 6  # numbers in the header, before the bits
 HEADER_BYTES = FIELDS * 4 + CELLS // 8
 ROW_BYTES, MARK_BYTES, WORD_BYTES = 24, 4, 8
 _ONE = np.uint64(1)  # unsigned, to avoid checks for negative indices

@@ -11,10 +11,10 @@ from mapserver.evidence.cells import CELLS
 from mapserver.evidence.fold_config import HASH
 from mapserver.evidence.record_kernels import FIELDS, HEADER_BYTES, MARK_BYTES, ROW_BYTES, WORD_BYTES
 
-_PLANE, _CELL = np.uint64(0xFF00), np.uint64(CELLS - 1)  # of a place
-_LOW, _NARROW_END = np.uint64(0xFFFF), np.uint64(1 << 32)  # of a count; of a vote with a 16-bit count
+_PLANE, _CELL = np.uint64(0xFF00), np.uint64(CELLS - 1)  # masks of a place
+_LOW, _NARROW_END = np.uint64(0xFFFF), np.uint64(1 << 32)  # mask of a count; first vote whose count exceeds 16 bits
 _ONE, _HASH = np.uint64(1), np.uint64(HASH)  # unsigned, to avoid checks for negative indices
-_SLOTS = 1024  # of a hash table; a list has 256 words at most
+_SLOTS = 1024  # size of the hash table; a list has 256 words at most
 
 
 @numba.njit(cache=True, nogil=True)

@@ -11,7 +11,7 @@ from mapserver.evidence.cells import CELLS, COUNT_MAX, COUNTS
 from mapserver.evidence.record_kernels import read_record
 from mapserver.evidence.record_writing import new_slots, write_record
 
-_INDEX_BITS = 40  # of a span, below its tier
+_INDEX_BITS = 40  # bits of a span's index, below its tier
 # unsigned indices avoid checks for negative ones
 
 

@@ -36,8 +36,8 @@ from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.owners import ANSWER_S, EVERY_OTHER, Owner, encode_owner, owner_of, this_process
 
-LOOK_S = 2.0  # between looks for another follower of this name
-HANGS_S = 30.0  # without a look at the journal, normally every second
+LOOK_S = 2.0  # interval of looks for another follower of this name
+HANGS_S = 30.0  # longest time without a look at the journal, normally every second
 T = TypeVar("T")
 
 

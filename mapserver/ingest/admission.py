@@ -13,7 +13,7 @@ from protocol.wire import keys
 from protocol.wire.messages import SampleBatch
 
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
-FUTURE_NS = DAY_NS  # clocks of the wrong zone or day are less wrong
+FUTURE_NS = DAY_NS  # tolerance for clocks of the wrong zone or day
 FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01: an earlier server clock is wrong
 
 

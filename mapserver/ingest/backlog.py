@@ -12,12 +12,12 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
-QUEUE_BYTES = 64 * 2**20  # waiting at most: half a minute of work is not worth more
-BATCH_BYTES = 1024  # of a batch besides its payload: the query waiting for a reply
-GROUP_BATCHES = 256  # per commit, for one sync
-GROUP_BYTES = 4 * 2**20  # per commit, one batch at least; takes 0.1 s
-FIRST_BYTES_PER_S = 4 * 2**20  # until measured
-PACE_WEIGHT = 0.1  # of the newest group in the running mean
+QUEUE_BYTES = 64 * 2**20  # limit of waiting bytes: half a minute of work is not worth more
+BATCH_BYTES = 1024  # overhead of a waiting batch: the query that waits for its reply
+GROUP_BATCHES = 256  # most batches per commit, for one sync
+GROUP_BYTES = 4 * 2**20  # most bytes per commit, one batch at least; takes 0.1 s
+FIRST_BYTES_PER_S = 4 * 2**20  # assumed rate until measured
+PACE_WEIGHT = 0.1  # weight of the newest group in the running mean
 MOST_RETRY_S = 30.0
 
 

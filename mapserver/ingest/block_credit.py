@@ -27,7 +27,7 @@ JUMPS = 50  # jumps to new ground, of the blocks a sample can open: 200 with 1 m
 JUMP_M = 200.0  # metres driven per further jump
 PAGES, FIRST_PAGES = 4000.0, 500.0  # opened blocks, of up to 11 kB: at most, and for a new machine
 STAY_S = 30.0  # server seconds that earn a sample's pages; standing costs one bucket in 300 s
-# of newcomers' credit: less for the next, and regained per minute; without keys, names are free
+# share of newcomers' credit that the next one lacks, regained per minute; without keys, names are free
 NEWCOMER = 1 / 64
 MOST_ACCOUNTS = 4096
 MOST_PAIRS = 2048  # remembered blocks times buckets; 300 s at 25 m/s on new ground enter 1400

@@ -27,7 +27,7 @@ from protocol.site.site_config import SiteConfig
 
 ASK_S = 1.0  # polling interval, because notifications may be lost
 OPEN_S = 2.0  # lifetime of a connection, whose file may be replaced
-PAUSE_S, MOST_PAUSE_S = 0.1, 5.0  # after unreadable rows; doubles, because reading up to them takes time
+PAUSE_S, MOST_PAUSE_S = 0.1, 5.0  # pause after unreadable rows; doubles, because reading up to them takes time
 T = TypeVar("T")
 log = logging.getLogger("mapserver.ingest.following")
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from protocol.errors import QueryError, Refusal
 
-MOST_WAITING = 1000  # a few kB each
+MOST_WAITING = 1000  # waiting queries, a few kB each
 Then = Callable[[QueryError | None], None]
 
 

@@ -37,7 +37,7 @@ from protocol.site.site_config import SiteConfig
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
-ACCEPTED = "accepted_store"  # kind of an event
+ACCEPTED = "accepted_store"  # event kind
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ Reply = Callable[[Ack | Refused], None]
 _Batch = tuple[Incoming, Reply]
 log = logging.getLogger("mapserver.ingest.writer")
 
-COMMIT_EVERY_S = 0.01  # least between commits, each of which costs a sync, pages and 0.5 ms
-HANGS_S = 30.0  # at one piece of work: a normal one takes less than a second
+COMMIT_EVERY_S = 0.01  # least interval of commits, each of which costs a sync, pages and 0.5 ms
+HANGS_S = 30.0  # longest piece of work; a normal one takes less than a second
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,11 @@ from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 from protocol.units import HOUR_NS
 
-FOLDER = "archive"  # in a store's folder
-FILE_SAMPLES = 2_000_000  # approximate; a busier hour is split
-GROUP_SAMPLES = 50_000  # approximate, per row group; batches are never cut
+FOLDER = "archive"  # subfolder of a store
+FILE_SAMPLES = 2_000_000  # approximate samples per file; a busier hour is split
+GROUP_SAMPLES = 50_000  # approximate samples per row group; batches are never cut
 TEMPORARY = "next.parquet.tmp"
-READABLE = 0o640  # other programs read files by the owner's group; files never change
+READABLE = 0o640  # file mode: other programs read by the owner's group
 ReceivedRow = tuple[JournalRow, int]  # with time of reception [ns]
 
 

@@ -32,7 +32,7 @@ from protocol.site.site_config import NAME as MACHINE_NAME
 from protocol.wire.codec import MAX_SEQ
 
 SCHEMA = 6
-KEY = b"sitegrid"  # of our metadata
+KEY = b"sitegrid"  # key of our metadata
 NAME = re.compile(r"\d{4}-\d\d-\d\dT\d\d_(\d+)-(\d+)\.parquet")
 _IDENTITY = ["machine", "row", "spool_id", "seq", "received_ns"]  # columns besides samples
 _RANGED = ("row", "received_ns", "stamp_ns", "x_m", "y_m")  # columns with ranges in Parquet's statistics

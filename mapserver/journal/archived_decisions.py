@@ -17,7 +17,7 @@ from mapserver.journal.places import FilePlace
 from protocol.errors import StoreError
 from protocol.files import write_whole
 
-FILE = "calibration.json"  # in an archive's folder
+FILE = "calibration.json"  # file name in an archive's folder
 
 
 def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> None:

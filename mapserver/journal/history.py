@@ -25,8 +25,8 @@ from protocol.arrays import Table
 
 # only kernels run in parallel; more do not help: lab/results/refold.md
 THREADS = min(2, len(os.sched_getaffinity(0)))
-PIECE = 16_384  # samples
-AHEAD = 24  # pieces, about one fold's
+PIECE = 16_384  # samples per piece
+AHEAD = 24  # pieces read ahead, about one fold's
 Samples = tuple[Table, NDArray[np.uint64]]  # with hashes of machine names
 T = TypeVar("T")
 

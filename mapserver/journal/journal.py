@@ -26,7 +26,7 @@ from mapserver.journal.rows import (
 from mapserver.journal.shortfall import Shortfall
 from protocol.errors import StoreError
 
-ROWS_AT_ONCE = 200  # read or removed per transaction, kept short for others
+ROWS_AT_ONCE = 200  # rows per transaction, kept short for others
 
 
 class ArchivedError(StoreError):
@@ -82,7 +82,7 @@ class JournalQueries(Protocol):
 
     @property
     def replica(self) -> str:
-        """Replication: "synchronous" if commits wait for another machine's disk, "asynchronous" or "none"."""
+        """Replication: "synchronous" if commits wait for another disk, "asynchronous" if one follows, else "none"."""
 
     def identity(self) -> StoreIdentity:
         """The store's identity; StoreError if damaged."""

@@ -22,7 +22,7 @@ from protocol.site.geometry import Bounds
 from protocol.wire.messages import SampleBatch
 
 SpoolKey = tuple[str, int]  # machine, spool_id
-LAST = 2**63 - 1  # no row number is higher
+LAST = 2**63 - 1  # upper bound of row numbers
 _EXTENT = struct.Struct("<3q4d")
 
 

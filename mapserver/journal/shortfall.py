@@ -14,7 +14,7 @@ from mapserver.journal.rows import Event, SpoolKey, Watermark
 from protocol.disk.high_water_mark import Traces
 
 KIND = "shortfall"
-ROW, EVENT = "row", "event"  # names in a mark; others are of spools
+ROW, EVENT = "row", "event"  # names in a mark, besides spools
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from mapserver.journal.rows import (
 )
 from protocol.errors import StoreError
 
-BYTES_AT_ONCE = 2**20  # per piece, to stay in the processor's cache
+BYTES_AT_ONCE = 2**20  # bytes per piece, to stay in the processor's cache
 _EXTENTS_AT_ONCE = 10_000
 
 

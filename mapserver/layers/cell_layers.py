@@ -24,7 +24,7 @@ from protocol.config import require_positive
 from protocol.errors import QueryError, Refusal
 from protocol.site import ground_classes
 
-LOG_STEP = math.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0])  # between resistance bins, in log(c_rr)
+LOG_STEP = math.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0])  # width of a resistance bin in log(c_rr)
 GRADE_STEP = float(ev.GRADE_CENTRES[1] - ev.GRADE_CENTRES[0])
 MAX_REACH_M = 50.0  # limit of filling; windows are widened by it
 SURE_AXIS = 0.2  # least mean axis, 0 to 1, that is a preference

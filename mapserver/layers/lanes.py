@@ -19,9 +19,9 @@ from protocol.arrays import Floats, Ints
 from protocol.queries.lanes import SCALE_M, LaneTile
 from protocol.site.geometry import BLOCK_CELLS
 
-FADES_M = 8 * BLOCK_CELLS * 1.0  # eight passes: fewer know the middle less well, more keep a moved road
+FADES_M = 8 * BLOCK_CELLS * 1.0  # metres, eight passes: fewer know the middle less well, more keep a moved road
 FADES_DAYS = 7.0  # half-life of an unused lane [days]
-LEAST_M = 0.1  # metres; smaller values are left out
+LEAST_M = 0.1  # smaller values [m] are left out
 
 
 def lane_tile(block: Block, pages: TimedPages, first: Ints, stamp_ns: int) -> LaneTile | None:

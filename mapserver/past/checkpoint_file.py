@@ -31,7 +31,7 @@ MAGIC = b"SGCHECK2"
 OPEN_END_NS = MAX_STAMP_NS + 1  # closing time of a snapshot: all samples of its rows
 INDEX = np.dtype([("x", "<i4"), ("y", "<i4"), ("first", "<i8"), ("bytes", "<i4"), ("crc32", "<u4")])
 TAIL = struct.Struct("<QII8s")  # blocks, bytes of the header, CRC-32 of index and header, MAGIC
-READ_BYTES = 2**22  # of consecutive blocks at once
+READ_BYTES = 2**22  # most bytes of consecutive blocks per read
 
 FileState = tuple[int, int, int]
 

@@ -26,10 +26,10 @@ from mapserver.past.checkpoint_file import (
     write_checkpoint,
 )
 
-FOLDER = "checkpoints"  # in a store's folder
+FOLDER = "checkpoints"  # subfolder of a store
 FactsBefore = Callable[[int], Mapping[str, Any]]  # dependencies of evidence stamped before a time
 _FORMAT = "%Y-%m-%dT%H.checkpoint"
-_SNAPSHOT = re.compile(r"snapshot-(\d+)\.checkpoint")  # in the store's folder
+_SNAPSHOT = re.compile(r"snapshot-(\d+)\.checkpoint")  # file name in a store's folder
 KEPT_SNAPSHOTS = 2
 log = logging.getLogger("mapserver.past.checkpoints")
 

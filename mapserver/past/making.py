@@ -23,8 +23,8 @@ from mapserver.past.checkpoints import Checkpoints
 from mapserver.past.past import StorePast
 from protocol.files import PRIVATE, whole_file
 
-FOLDED_AT_ONCE = 32_768  # samples: 30 ms
-MERGED_AT_ONCE = 32  # blocks: 10 ms
+FOLDED_AT_ONCE = 32_768  # samples per step, 30 ms
+MERGED_AT_ONCE = 32  # blocks per step, 10 ms
 SPILL_SAMPLES = 1_000_000  # samples whose folds take 50 MB, which then move to disk
 SPILL_FILE = "spill"
 

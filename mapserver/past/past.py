@@ -31,8 +31,8 @@ from protocol.arrays import Table
 from protocol.site.geometry import Bounds, CellWindow, GridGeometry
 
 NamedSamples = tuple[Table, NDArray[np.uint64]]  # with hashes of machine names
-FEW_ROWS = 8  # left to whoever continues the map: some ms
-MOST_ROUNDS = 20  # if batches arrive faster than this, they must be held back
+FEW_ROWS = 8  # rows left to whoever continues the map, some ms
+MOST_ROUNDS = 20  # rounds of a fold; batches that arrive faster must be held back
 
 
 @dataclass(frozen=True)

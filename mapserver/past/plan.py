@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from protocol.units import DAY_NS, HOUR_NS
 
-GRACE_NS = 300 * 10**9  # after an hour's end, for samples still on machines
+GRACE_NS = 300 * 10**9  # wait after an hour's end for samples still on machines
 
 
 def due(

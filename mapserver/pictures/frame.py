@@ -15,7 +15,7 @@ from protocol.site.geometry import Bounds
 Image = NDArray[np.uint8]  # (height, width, 3), BGR
 Colour = tuple[int, int, int]
 
-LEFT, TOP, BOTTOM, PAD = 84, 66, 52, 18  # around the ground [px]
+LEFT, TOP, BOTTOM, PAD = 84, 66, 52, 18  # margins around the ground [px]
 LINE_PX, SWATCH_PX, MIN_PANEL_PX = 24, 16, 180
 COMPASS_PX, BAR_PX = 94, 130
 MAX_LISTED, MAX_NAME = 24, 21  # machines in the legend, letters per name

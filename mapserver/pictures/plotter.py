@@ -20,7 +20,7 @@ from protocol.site.ground_classes import SLOPE, UNKNOWN, ZONES, resistance_class
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom [px]
 
-MAX_SIDE_PX, MAX_AREA_PX, MAX_CELL_PX = 1240, 800_000, 64  # of the ground, without margins
+MAX_SIDE_PX, MAX_AREA_PX, MAX_CELL_PX = 1240, 800_000, 64  # limits of the ground, without margins
 ARROW_SPACING_PX = 34
 UNKNOWN_COLOUR, WRONG_COLOUR = (228, 228, 228), (255, 0, 255)
 FLAT_COLOUR, SLOPE_COLOUR = ZONES[0].bgr, ZONES[1].bgr

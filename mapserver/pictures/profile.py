@@ -16,7 +16,7 @@ from protocol.units import JOULE_PER_KWH
 
 CHART_PX, GAP_PX, LEAST_WIDTH_PX = 110, 34, 640
 GRID: Colour = (225, 225, 225)
-UNKNOWN: Colour = (228, 228, 228)  # as on the map
+UNKNOWN: Colour = (228, 228, 228)  # the same grey as on the map
 LINE: Colour = (180, 90, 20)
 
 

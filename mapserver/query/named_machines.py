@@ -18,10 +18,10 @@ from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteMachine
 from protocol.units import HOUR_NS, MINUTE_NS
 
-LOOK_BACK_NS = HOUR_NS  # before the time asked about; older masses say nothing
+LOOK_BACK_NS = HOUR_NS  # time before the query's; older masses say nothing
 SLOT_NS = 10 * MINUTE_NS  # span of one remembered fastest sample
 PACE_MPS = 1.0  # slower machines only stood about
-MOST_SHOWN = 8  # names in a refusal
+MOST_SHOWN = 8  # names listed in a refusal
 
 
 @dataclass(frozen=True)

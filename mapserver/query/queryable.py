@@ -103,15 +103,15 @@ def _oldest(waiting: Mapping[int, Work]) -> int:
     return next(iter(waiting))
 
 
-ANSWER_BYTES = 2**25  # of all waiting and running answers: 40 pieces, or 2000 points
-MOST_PAST = 16  # waiting or running
+ANSWER_BYTES = 2**25  # budget of waiting and running answers: 40 pieces, or 2000 points
+MOST_PAST = 16  # waiting and running answers of the past
 MAX_QUESTION = 4096  # bytes of a query's parameters
 WITH_PLACES = {
     name
     for name, query in QUERIES.items()
     if any(p.kind.form is ValueForm.PLACES for p in parameters_of(query).values())
 }
-ANSWERED = "queries_answered"  # a counter of `info`
+ANSWERED = "queries_answered"  # counter in `info`
 log = logging.getLogger("mapserver.query.queryable")
 
 

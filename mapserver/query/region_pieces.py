@@ -21,11 +21,11 @@ from protocol.queries.answers import Piece
 from protocol.queries.places import Place
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-PIECE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
-READ_BYTES = 2**24  # of cell layers per answer, if larger cells are their means
+PIECE_BYTES = 256 * 256 * 3 * 4  # largest answer: three layers of 256 x 256 cells
+READ_BYTES = 2**24  # most cell layers read per answer, if larger cells are their means
 MOST_OPEN = 16  # regions read at the same time
-IDLE_S = 30.0  # without a request until a region is dropped; a piece takes 20 s at 300 kbit/s
-OPEN_S = 600.0  # until an open region is dropped, as its pages leave the grid
+IDLE_S = 30.0  # time without a request that drops a region; a piece takes 20 s at 300 kbit/s
+OPEN_S = 600.0  # time that drops an open region, as its pages leave the grid
 
 
 @dataclass(frozen=True)

@@ -47,12 +47,12 @@ log = logging.getLogger("mapserver.query.road_maps")
 FRESH_S = 10.0
 # Largest age relative to the last making, 1 % of the time, so that small or new sites get fresh answers.
 CHEAP = 100
-COSTLY = 20  # the same at least, so that large maps, which take seconds, spend no more than 5 %
-SPARE = 3  # of the last making: begin before roads are too old, by this factor with the making
-ASKED_S = 600.0  # after the last question, roads are still made
-PATIENCE_S = 2.0  # of a picture for the first roads
-END_S = 1.0  # for a running making at the end
-LOOK_BACK_NS = 30 * 24 * HOUR_NS  # of traffic before the site's now; older rows are not read
+COSTLY = 20  # least age relative to the last making, so that large maps cost no more than 5 %
+SPARE = 3  # lead before roads are too old, in durations of the last making
+ASKED_S = 600.0  # time after the last question during which roads are made
+PATIENCE_S = 2.0  # longest wait of a picture for the first roads
+END_S = 1.0  # longest wait for a running making on shutdown
+LOOK_BACK_NS = 30 * 24 * HOUR_NS  # traffic before the site's now; older rows are not read
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery
 from protocol.site.geometry import Bounds
 from protocol.units import DAY_NS, HOUR_NS, JOULE_PER_KWH
 
-MOST_SEGMENTS = 10_000  # per answer: 250 km of roads, 3 MB
-MOST_CHANGES = 1000  # per worklist, the newest
-LINE_POINTS = 5  # every so many points of a line, a metre apart, are sent
+MOST_SEGMENTS = 10_000  # segments per answer: 250 km of roads, 3 MB
+MOST_CHANGES = 1000  # newest changes per worklist
+LINE_POINTS = 5  # every fifth point of a line is sent; points are a metre apart
 Read = Callable[[int | None, str], RoadMap]  # as `RoadMaps.read`: as of a time, with one machine's traffic
 
 

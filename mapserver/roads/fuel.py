@@ -24,7 +24,7 @@ from mapserver.roads.tally import PER_L, PER_M, PER_V2
 from protocol.arrays import Floats, Ints
 from protocol.units import GRAVITY_MPS2
 
-ROTATING = 1.1  # effective over real mass of a hauler with rotating parts
+ROTATING = 1.1  # ratio of effective to real mass, with a hauler's rotating parts
 BURNED_SHARE = 0.03  # relative standard deviation of an engine controller's fuel, by data sheets
 LEAST_M = 100.0  # metres with known fuel that a fit needs
 JOULES = 1e6  # joules per unit of the fit, to balance its columns

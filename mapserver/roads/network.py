@@ -24,7 +24,7 @@ JOIN_M = 6.0  # closer junctions are one, because crossing lines share cells [m]
 ROUNDS = 8  # most rounds of pruning
 # metres along a line in the 5 x 5 cells around a driven cell: a fifth of a pass
 DRIVEN_M = 1.0
-DRIVEN_SHARE = 0.7  # of an edge's cells must be driven
+DRIVEN_SHARE = 0.7  # least share of an edge's cells that are driven
 # A road ends where metres fall to this share of those so many cells farther in: half of the 5 x 5 cells lies beyond.
 END_SHARE, INWARD = 0.45, 8
 TANGENT = 4  # cells on each side that set a line's direction

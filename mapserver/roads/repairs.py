@@ -22,7 +22,7 @@ from mapserver.roads.segments import SegmentTable
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-HALF_WIDTH_M = 3.0  # metres: the driven strip with position errors, half a lane distance
+HALF_WIDTH_M = 3.0  # metres of the driven strip with position errors, half a lane distance
 
 
 class RepairTuning(NamedTuple):

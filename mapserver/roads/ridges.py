@@ -17,11 +17,11 @@ from protocol.arrays import Bools, Floats, Ints
 AXES = ev.SECTORS // 2
 ALONG_M, ACROSS_M = 4.0, 1.0  # standard deviations of the blur [m]
 SIDE_M = 3.0  # half the least lane distance [m]
-SHARE = 0.55  # of the highest response across the line
+SHARE = 0.55  # least share of the highest response across the line
 LEAST_M = 0.05  # least response [m/m2]: below one pass in a bend between two axes
-_UNITS = 1 << 10  # per unit of weight
+_UNITS = 1 << 10  # integer units per unit of weight
 _LEAST_WEIGHT = 20  # smallest weight, in units
-SCALE = 1 << 6  # of 1/4096 m per unit: sums stay integers that a float64 holds
+SCALE = 1 << 6  # units of the blurred metres [1/4096 m]: sums stay integers that a float64 holds
 
 
 class Blur:

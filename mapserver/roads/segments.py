@@ -14,7 +14,7 @@ from mapserver.roads.cutting import LATTICE_M, cut, gathered
 from mapserver.roads.network import Network
 from protocol.arrays import AnyArray, Floats, Ints
 
-AXES = ("e", "n")  # more axes would rename more roads, near a border of two
+AXES = ("e", "n")  # names of axes; more would rename more roads, near a border of two
 FIFTHS = 5
 
 

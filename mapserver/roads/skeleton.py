@@ -22,7 +22,7 @@ from mapserver.roads.ridges import AXES, Blur, ridges
 from protocol.arrays import AnyArray, Bools, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-ROUNDS = 8  # ridges are five cells wide, crossings more
+ROUNDS = 8  # rounds of thinning: ridges are five cells wide, crossings more
 REACH = 2 * ROUNDS + 1
 
 
@@ -88,7 +88,7 @@ TILE = 128  # raster cells to a side
 RASTER_M = 1.0  # metres; smaller cells are joined, as positions are no better
 NEAR = 2  # cells on each side of a line that count for it
 EDGE = REACH + 1  # ridge cells around a tile that its lines depend on
-# of a window (a tile and EDGE cells around), and of the tiles before, at and after it
+# slices of a window (a tile and EDGE cells around), and of the tiles before, at and after it
 _OF_WINDOW = {-1: slice(0, EDGE), 0: slice(EDGE, EDGE + TILE), 1: slice(EDGE + TILE, None)}
 _OF_TILE = {-1: slice(TILE - EDGE, None), 0: slice(None), 1: slice(0, EDGE)}
 

@@ -17,11 +17,11 @@ from mapserver.roads.cutting import LATTICE_M
 from protocol.arrays import Floats, Ints, Table
 from protocol.units import HOUR_NS
 
-CELL_M = LATTICE_M / 10  # metres; divides the lattice's cell
+CELL_M = LATTICE_M / 10  # cell edge [m]; divides the lattice's cell
 HOURS = 120  # driven hours kept; the journal has older ones
-SECTORS = 16  # of the direction of travel, the first centred on east
+SECTORS = 16  # headings per turn, the first centred on east
 PER_M = 1000  # units per metre, also of positions
-PER_C = 100_000  # units of c_rr and gradient
+PER_C = 100_000  # units per unit of c_rr and gradient
 SLOWEST_MPS = 0.1  # lower bound [m/s]: standing would take for ever
 _C2_SHIFT = 100  # units of squares over PER_C squared, so that hourly sums fit
 _AXIS_BITS, _SECTOR_BITS = 17, 4  # sites reach 100 km from their origin
@@ -36,7 +36,7 @@ SUMS = (
     *("metres", "weighed", "measured", "graded", "kg", "c", "c2", "east", "north"),
     *("fuelled", "fuel", "ms", "v2", "x", "y"),
 )
-PER_L, PER_V2 = 1_000_000, 100  # units of litres and of squared speeds
+PER_L, PER_V2 = 1_000_000, 100  # units per litre, and per squared speed
 TALLY = np.dtype([("key", "<i8"), *((name, "<i8") for name in SUMS), ("machines", "<u8")])
 _SECTOR_RAD = 2 * np.pi / SECTORS
 

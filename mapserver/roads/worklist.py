@@ -15,7 +15,7 @@ from protocol.units import DAY_NS, DIESEL_J_PER_L
 
 # Full power over mass [W/kg], which turns work into time. Assumed; loaded trucks have 5, empty ones 11.
 ENGINE_W_PER_KG = 6.0
-TIE_SHARE = 0.05  # of the highest loss; smaller differences tie
+TIE_SHARE = 0.05  # share of the highest loss; smaller differences tie
 TREND_DAYS = 3  # days a trend needs; fewer are weather
 
 

@@ -25,7 +25,7 @@ from protocol.units import GRAVITY_MPS2
 
 CREEP_MPS = 0.3  # slowest driving [m/s]: what the power cannot do at this speed, it cannot do
 LATE_S = 0.3  # seconds; fitted to simulated drives over soil patches: without it energies are 3 % too low
-SMOOTH_M = 9.0  # metres, about a machine's length, because it stands on all of it
+SMOOTH_M = 9.0  # metres of smoothing, about a machine's length, because it stands on all of it
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from protocol.arrays import AnyArray, Floats, Ints
 
-LEAST_SHARE = 0.25  # of the weights of four cells; less is a cell's corner, not ground under a wheel
+LEAST_SHARE = 0.25  # least weight of known cells; less is a cell's corner, not ground under a wheel
 HALF = 2**20
 CURVE_M = 7.0  # metres over which a corner changes the direction: about a machine's turning circle
 REVERSAL_RAD = math.radians(120.0)  # at sharper corners a machine stops and reverses

@@ -23,7 +23,7 @@ from protocol.arrays import Bools, Floats, Ints
 Cell = tuple[int, int]  # row and column in a window
 
 LOOK_AHEAD = 64  # places that a straight piece may skip; the next pass skips as many again
-BAND = 16  # cells; with 8 one map in a hundred has its cheapest line outside (by 2 %), with 24 no more
+BAND = 16  # half width in cells; with 8 one map in a hundred has its cheapest line outside (by 2 %), with 24 none more
 
 
 @dataclass(frozen=True)

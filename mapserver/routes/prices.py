@@ -29,7 +29,7 @@ from protocol.arrays import AnyArray, Bools, Floats, Ints
 
 DEAREST = 0.9  # quantile of known cost; at the median, the cheapest line would cross any unknown ground
 LOOSE = 0.25  # price without known ground nearby, as loose sand
-BINS = np.geomspace(0.001, 5.0, 257)  # of resistance plus slope, 3 % each
+BINS = np.geomspace(0.001, 5.0, 257)  # edges of resistance plus slope, 3 % each
 NEEDS = ("resistance_filled", "resistance_filled_std", "grade_east_filled", "grade_north_filled", "visits")
 RESISTANCE, EAST, NORTH = PRICED = ("price", "price_east", "price_north")
 Square = tuple[int, int]

@@ -27,7 +27,7 @@ LAYERS = (
     "visits",
     "confidence",
 )
-STEP_M = 1.0  # of the drive [m]; answers have longer steps
+STEP_M = 1.0  # step of the drive [m]; answers have longer ones
 # Relative spread of drives on equal ground (drivers, crossing traffic), from three simulated recordings: energies
 # differed by 2 to 5 % from drives over the true map, times by 1 to 2 %.
 ENERGY_STD, TIME_STD = 0.03, 0.015

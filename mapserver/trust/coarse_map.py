@@ -16,7 +16,7 @@ import numpy as np
 from mapserver.calibration.ledger import CELL_M, PENDING_ROWS
 from protocol.arrays import Floats, Ints, Table
 
-PERIOD_S = 1800.0  # seconds; only cells of the same period are compared
+PERIOD_S = 1800.0  # seconds within which cells are compared
 PERIODS = 16  # periods kept; a repaired machine is cleared when most of them are good
 UNITS_PER_M = 1024
 UNITS_PER_LEVEL = 1024
@@ -26,7 +26,7 @@ LEVEL_FLOOR = 0.01
 
 _AXIS_BITS = 20
 _HALF = 1 << (_AXIS_BITS - 1)
-ROW = 1 << _AXIS_BITS  # one cell north, in codes; one cell east is 1
+ROW = 1 << _AXIS_BITS  # code of one cell further north; one cell east is 1
 _PERIOD_SHIFT = 2 * _AXIS_BITS
 _VARIANCE_UNITS = 1024  # units per m2
 _METRES, _LEVEL = 0, 1

@@ -14,7 +14,7 @@ from protocol.arrays import Floats, Ints
 
 _LOWEST_C_RR = 0.004  # lower bound: ratios of less mean nothing
 _MOST_CELLS = 8000
-_MEDIAN_ERROR = 1.85  # from a median absolute deviation to a median's standard error: 1.25 / 0.6745
+_MEDIAN_ERROR = 1.85  # factor from a median absolute deviation to a median's standard error, 1.25 / 0.6745
 
 
 @dataclass(frozen=True)

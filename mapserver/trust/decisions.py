@@ -18,7 +18,7 @@ from mapserver.trust.judgement import Reason
 
 KIND = "trust"
 AUDIT, PERSON = "audit", "person"
-DISTRUST_AFTER, TRUST_AFTER = 2, 4  # successive verdicts
+DISTRUST_AFTER, TRUST_AFTER = 2, 4  # successive verdicts needed
 
 
 @dataclass(frozen=True)

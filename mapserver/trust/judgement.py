@@ -30,7 +30,7 @@ class Reason(StrEnum):
     OFFSET = "offset"
     CLOCK = "clock"
     STUCK = "stuck"
-    DISAGREES = "disagrees"  # in no way that has a name
+    DISAGREES = "disagrees"  # disagrees in no way that has a name
     BEYOND_DATA_SHEET = "beyond_data_sheet"  # a faulty bias or scale, even if the map is right
 
 

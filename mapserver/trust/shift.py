@@ -13,13 +13,13 @@ REACH = 3  # cells tried in each direction
 _EDGE = 2 * REACH + 1
 _SHIFTS = _EDGE * _EDGE
 ERROR_LENGTH_M = 200.0  # metres driven with one position error: twice 30 s at 3 m/s
-_MOST_CELLS = 4000  # more cost time and add nothing
+_MOST_CELLS = 4000  # cells compared; more cost time and add nothing
 _FEWEST_CELLS = 50
 _BORDER_BITS, _BORDER_LEVELS = 3, 0.25  # a square of 16 m with this range of levels holds a border
-_CLIP = 1.0  # of level differences; borders of sand alone would decide
+_CLIP = 1.0  # limit of level differences, or borders of sand alone would decide
 # Relative cost per squared cell, because parallel borders do not show shifts along them.
 _PRICE = 0.01
-_GROUPS = 8  # of 32 m squares, left out in turn (jackknife)
+_GROUPS = 8  # groups of 32 m squares, left out in turn (jackknife)
 _GROUP_BITS = 4
 
 _STEPS = np.arange(-REACH, REACH + 1)

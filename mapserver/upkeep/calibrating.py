@@ -26,15 +26,15 @@ from protocol.errors import StoreError
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 from protocol.units import DAY_NS
 
-SPAN_NS = 2 * DAY_NS  # of samples, which hold the driving that a ledger keeps
+SPAN_NS = 2 * DAY_NS  # age of samples read, which hold the driving that a ledger keeps
 AHEAD_NS = 600 * 10**9  # tolerance beyond the site's now, for clocks and delays
 EVERY_NS = 60 * 10**9  # site time between solves, a fifth of an epoch
 REST = 50.0  # pause relative to a run: 2 % of a core, even for replays and large fleets
-TURN_SAMPLES = 200_000  # read per turn, in about 0.2 s
+TURN_SAMPLES = 200_000  # samples read per turn, in about 0.2 s
 Decide = Callable[[Solution, int], object]
 Group = tuple[str, ...]
 log = logging.getLogger("mapserver.upkeep.calibrating")
-RECENT = 10  # marks; a machine silent for longer says nothing of now
+RECENT = 10  # marks after which a silent machine says nothing of now
 
 
 class Calibrating:

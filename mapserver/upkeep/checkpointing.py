@@ -22,8 +22,8 @@ from mapserver.upkeep.jobs import PIECE_S
 from protocol.units import MINUTE_NS
 
 LATE_ROWS = 5000  # late rows after which a checkpoint is rebuilt; reading them takes 50 ms
-RESERVE_BYTES = 2**30  # of the disk, kept for samples
-LATER_S = 60.0  # after damage, or without room
+RESERVE_BYTES = 2**30  # free space kept for samples
+LATER_S = 60.0  # pause after damage, or without room
 log = logging.getLogger("mapserver.upkeep.checkpointing")
 
 

@@ -28,13 +28,13 @@ from mapserver.journal.journal import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
 from protocol.queries.answers import GroundChange
 
-PIECE_S = 0.3  # per turn, while others wait; ten machines' hourly checkpoint takes a second in all
-LOOK_BLOCKS = 256  # per look for changes; batches wait while the writer copies their pages
+PIECE_S = 0.3  # seconds per turn, while others wait; ten machines' hourly checkpoint takes one in all
+LOOK_BLOCKS = 256  # blocks per look for changes; batches wait while the writer copies their pages
 # A block is examined after so many turns without traffic, or at most so many: each pass changes it again, and each look
 # compares all of its evidence.
 REST_TURNS, MOST_TURNS = 3, 20
-LOOK_S = 60.0  # between looks for rows to archive, as files are hourly
-KEEP_S = 3600.0  # between looks for decisions, without new files
+LOOK_S = 60.0  # interval of looks for rows to archive, as files are hourly
+KEEP_S = 3600.0  # interval of looks for decisions, without new files
 Report = Callable[[Mapping[str, Verdict], int], None]
 Known = Callable[[], tuple[SampleCorrections, Mapping[str, MachineErrors]]]
 Publish = Callable[[GroundChange], None]

@@ -27,7 +27,7 @@ from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError
 
-RETRY_S, MOST_RETRY_S = 1.0, 60.0  # after unreadable rows; doubles, because a fold up to them may take minutes
+RETRY_S, MOST_RETRY_S = 1.0, 60.0  # pause after unreadable rows; doubles, as a fold may take minutes
 T = TypeVar("T")
 log = logging.getLogger("mapserver.upkeep.refolding")
 

@@ -9,7 +9,7 @@ from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 
 RESTART_SAMPLES = 500_000  # samples, about a second of a restart, that trigger an early snapshot
-SHARE = 0.05  # of the time, at most
+SHARE = 0.05  # largest share of the time
 
 
 class Snapshots:

@@ -1,3 +1,3 @@
 """The journal in a PostgreSQL database, for standby servers or many readers."""
 
-MARK_FILE = "journal-mark"  # in a server's folder, beside snapshots
+MARK_FILE = "journal-mark"  # file name in a server's folder, beside snapshots

@@ -12,7 +12,7 @@ from psycopg import conninfo
 from protocol.errors import ConfigError, StoreError
 
 Connection = psycopg.Connection[tuple[Any, ...]]
-SCHEMA = "sitegrid"  # of the tables
+SCHEMA = "sitegrid"  # PostgreSQL schema of the tables
 MISSING = ("3D000", "3F000", "42P01")  # SQLSTATEs: no such database, schema, table
 REPLICAS = """SELECT current_setting('synchronous_standby_names') <> '',
 (SELECT count(*) FROM pg_stat_replication)"""

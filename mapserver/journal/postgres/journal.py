@@ -32,7 +32,7 @@ from protocol.errors import StoreError
 from protocol.files import make_private
 
 _WHOSE = "SELECT epoch, writer FROM head"
-LOOK_S = 0.1  # between attempts to take the lock
+LOOK_S = 0.1  # interval of attempts to take the lock
 _PUT = (
     "ON CONFLICT (machine, spool_id) DO UPDATE SET"
     " seq = excluded.seq, lost = excluded.lost, newest_ns = excluded.newest_ns, crc32 = excluded.crc32"

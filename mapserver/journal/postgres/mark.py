@@ -12,7 +12,7 @@ from protocol.disk.high_water_mark import Traces, read_mark
 from protocol.disk.write_ahead_log import LogScan
 from protocol.errors import StoreError
 
-# besides a common mark's values: store id, epoch, checksum of the last row
+# mark values besides the common ones: store id, epoch, checksum of the last row
 STORE, EPOCH, CHECKSUM = "store", "epoch", "checksum"
 
 

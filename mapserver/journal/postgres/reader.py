@@ -27,8 +27,8 @@ WHERE extent.last_stamp_ns >= %(from_ns)s AND extent.first_stamp_ns <= %(to_ns)s
 _RECEIVED = """SELECT pg_is_in_recovery(), pg_last_wal_receive_lsn()::text,
 EXISTS (SELECT FROM pg_stat_wal_receiver WHERE COALESCE(status, 'streaming') = 'streaming')"""
 _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
-_LOOK_S = 1.0  # polling, because notifications may be lost
-_LOOK_AGAIN_S = 0.05  # at a replica, without notifications
+_LOOK_S = 1.0  # polling interval, because notifications may be lost
+_LOOK_AGAIN_S = 0.05  # polling interval at a replica, which has no notifications
 
 
 class PostgresQueries(TableQueries):

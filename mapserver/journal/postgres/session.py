@@ -26,13 +26,13 @@ from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.postgres.connection import REPLICAS, connect, line, replica_of
 from protocol.errors import StoreError
 
-HANGS_S = 1.5  # after which a silent holder loses the lock
-AWAKE_S = 0.3  # between signs of life
+HANGS_S = 1.5  # silence after which a holder loses the lock
+AWAKE_S = 0.3  # interval of signs of life
 ANSWER_S = 2 * HANGS_S  # timeout of a sign of life, normally answered at once
 LOOK_TURNS = 10  # signs of life between two looks for replicas
-LOCK = 0x517E62D1  # of journals; advisory locks are per database
+LOCK = 0x517E62D1  # advisory lock of journals, per database
 FENCED = "SG001"  # SQLSTATE of `advance`
-OLDEST = 140_000  # older versions do not end idle sessions
+OLDEST = 140_000  # PostgreSQL 14; older ones do not end idle sessions
 SET_UP = f"""
 SET idle_session_timeout = '{HANGS_S:g}s'; SET idle_in_transaction_session_timeout = '{HANGS_S:g}s';
 SET statement_timeout = 0; SET lock_timeout = 0;

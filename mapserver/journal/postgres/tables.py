@@ -12,9 +12,9 @@ from psycopg.sql import quote
 from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
 from mapserver.journal.table_writer import new_meta
 
-MAKING = 0x517E62D2  # advisory lock during creation
+MAKING = 0x517E62D2  # advisory lock while tables are made
 SCHEMA = 4
-CHANNEL = "sitegrid_journal"  # of notifications, per database
+CHANNEL = "sitegrid_journal"  # notification channel, per database
 # Every commit updates the single line of `head`, which numbers rows densely in commit order; a sequence does not, and
 # readers would lose rows. `writer`: a name by which an epoch's writer recognises it.
 TABLES = """

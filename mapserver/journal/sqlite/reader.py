@@ -47,7 +47,7 @@ _READ_SOME = """SELECT row, record FROM extent LEFT JOIN journal USING (row)
 WHERE extent.last_stamp_ns >= :from_ns AND extent.first_stamp_ns <= :to_ns
     AND west_m <= :east_m AND east_m >= :west_m AND south_m <= :north_m AND north_m >= :south_m
     AND row > :after AND row <= :until ORDER BY row"""
-_LOOK_S = 0.02  # between looks at the file's version, of 10 us
+_LOOK_S = 0.02  # polling interval; a look costs 10 us
 _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
 
 
