@@ -223,7 +223,7 @@ def _correct(rows: Any, machine: Any, places: Any, spans: Any, values: Any, unit
 
 
 def values(one: Correction) -> tuple[float, ...]:
-    """As VALUES."""
+    """Values of a correction, as VALUES."""
     return one.zero, one.scale, one.across, one.most_share, one.rolls, one.drags
 
 

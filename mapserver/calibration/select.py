@@ -82,7 +82,7 @@ def observed_part(result: Estimate, share: float) -> tuple[Floats, Floats]:
 
 
 def _by_evidence(pb: FleetProblem, result: Estimate) -> Floats:
-    """Without data sheets on scales: many together are no evidence."""
+    """Covariance without data sheets on scales: many together are no evidence."""
     matrix = result.prior.matrix + sum(each.matrix for each in result.information.values())
     return inverse(without_data_sheet(pb, matrix, range(len(pb.names))))
 

@@ -60,7 +60,7 @@ def merged(one: Table, other: Table) -> Table:
 
 
 def slot(keys: Ints) -> Ints:
-    """In SLOT_NS since 1970."""
+    """Slot number, in SLOT_NS since 1970."""
     return keys >> SLOT_SHIFT
 
 

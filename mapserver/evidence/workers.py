@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Workers:
-    """map: like the built-in, for `count` elements at a time, such as a thread pool's."""
+    """Workers of a fold. map: like the built-in, for `count` elements at a time, such as a thread pool's."""
 
     count: int = 1
     map: Callable[[Callable[[int], Any], Iterable[int]], Iterable[Any]] = map

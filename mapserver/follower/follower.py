@@ -147,11 +147,11 @@ class FollowerSource:
         return [change for number, change in known if number > after]
 
     def machines(self) -> list[dict[str, Any]]:
-        """Not available."""
+        """Only at the server."""
         _only_at_the_server("what the audit of machines found")
 
     def calibration(self) -> CalibrationAnswer:
-        """Not available."""
+        """Only at the server."""
         _only_at_the_server("what is known of calibrations")
 
     def info(self) -> dict[str, Any]:

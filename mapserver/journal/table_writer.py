@@ -112,12 +112,12 @@ def new_meta(schema: int, site: str, frame: str, descends: Iterable[str]) -> lis
 
 
 def meta_line(key: str, value: str) -> Line:
-    """With checksum."""
+    """A meta line with checksum."""
     return key, value, checksum(key, value)
 
 
 def watermark_line(machine: str, spool_id: int, watermark: Watermark) -> Line:
-    """With checksum; 64-bit ids as bytes, because databases' integers are signed."""
+    """A watermark line with checksum; 64-bit ids as bytes, because databases' integers are signed."""
     values = (machine, spool_id.to_bytes(8, "big"), watermark.seq, watermark.lost, watermark.newest_ns)
     return (*values, checksum(*values))
 

@@ -71,7 +71,7 @@ class _Server(ThreadingMixIn, WSGIServer):
     daemon_threads = True  # a slow visitor must not delay the end
 
     def server_bind(self) -> None:
-        """Without the slow lookup of the host's full name of HTTPServer."""
+        """Bind without HTTPServer's slow lookup of the host's full name."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
         self.setup_environ()

@@ -58,7 +58,7 @@ class Header:
     oldest_ns: int = 0
 
     def with_totals(self, state: GridState) -> Header:
-        """With the totals of a grid's state."""
+        """The header with the totals of a grid's state."""
         return replace(self, **{field.name: getattr(state, field.name) for field in fields(GridState)[1:]})
 
     @property

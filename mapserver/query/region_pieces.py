@@ -87,7 +87,7 @@ class PieceGrid:
         return len(self._columns) * len(self._rows)
 
     def piece(self, number: int) -> CellWindow:
-        """One piece."""
+        """A piece by its number."""
         left, right = self._columns[number % len(self._columns)]
         bottom, top = self._rows[number // len(self._columns)]
         return CellWindow(left, bottom, right - left, top - bottom)

@@ -86,7 +86,7 @@ class RoadMap:
 
     @cached_property
     def ledger(self) -> Ledger:
-        """Of all remembered hours."""
+        """The ledger of all remembered hours."""
         return self.ledgers.ledger(self.tally, HOUR_NS)
 
     def hours_with_driving(self, from_ns: int, to_ns: int) -> tuple[Ledger, float]:

@@ -94,7 +94,7 @@ def slope_of(ledger: Ledger, segments: SegmentTable, owner: Ints) -> Floats:
 
 
 def _std(ledger: Ledger) -> Floats:
-    """(k,), of the mean c_rr; NaN if unmeasured.
+    """Deviation (k,) of the mean c_rr; NaN if unmeasured.
 
     Noise of single passes, common error of all passes, and unmeasured slices.
     """

@@ -216,7 +216,7 @@ def _trace(links: Any, degree: Any, cells: Any, ends: Any) -> tuple[int, int]:
 
 @numba.njit(cache=True, nogil=True)
 def _trace_between(links: Any, degree: Any, seen: Any, cells: Any, ends: Any) -> tuple[int, int]:
-    """Between ends and junctions; marks cells as seen."""
+    """Chains between ends and junctions; marks cells as seen."""
     used, count = 0, 0
     for place in range(8 * len(links)):
         start, second = place // 8, links[place // 8, place % 8]
@@ -256,7 +256,7 @@ def _trace_rings(links: Any, degree: Any, seen: Any, cells: Any, ends: Any, used
 
 @numba.njit(cache=True, nogil=True)
 def _follow(links: Any, degree: Any, start: int, second: int, cells: Any, used: int) -> int:
-    """Up to the next end or junction, or back to `start`."""
+    """A chain up to the next end or junction, or back to `start`."""
     before, here = start, second
     if used < len(cells):
         cells[used] = start

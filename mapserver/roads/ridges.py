@@ -115,7 +115,7 @@ def _outstanding(response: Any, side: int, least: Any, across: Any, out: Any) ->
 
 @numba.njit(cache=True, nogil=True)
 def _highest(response: Any, row: int, column: int, axis: int, across: Any) -> float:
-    """Of an axis and its neighbours: between two lanes an oblique axis collects a little of both."""
+    """Highest response of an axis and its neighbours: between two lanes an oblique axis collects a little of both."""
     highest = response[axis, row, column]
     for step in range(across.shape[1]):
         y, x = row + across[axis, step, 0], column + across[axis, step, 1]

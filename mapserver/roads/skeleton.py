@@ -186,14 +186,14 @@ class Skeletons:
         return np.asarray(np.argwhere(lines) + np.array(tile[::-1]) * TILE, np.int64)
 
     def _axes(self, tile: Tile, margin: int) -> Ints:
-        """(rows, columns, AXES), of a tile and its margin."""
+        """Metres (rows, columns, AXES) of a tile and its margin."""
         size = TILE + 2 * margin
         out = np.zeros((size, size, AXES), np.int64)
         _fill(*self._parts(tile, margin), out)
         return out
 
     def _around(self, tile: Tile, places: Ints) -> Ints:
-        """(n, AXES), of the 5 x 5 cells around cells (n, 2)."""
+        """Metres (n, AXES) of the 5 x 5 cells around cells (n, 2)."""
         numbers = np.full((TILE + 2 * NEAR, TILE + 2 * NEAR), -1, np.int64)
         own = places - np.array(tile[::-1]) * TILE + NEAR
         numbers[own[:, 0], own[:, 1]] = np.arange(len(own))

@@ -20,7 +20,7 @@ TREND_DAYS = 3  # days a trend needs; fewer are weather
 
 
 class Ranked(NamedTuple):
-    """order: (k,) segments, most expensive first; rank: (k,), from 1."""
+    """Segments by loss. order: (k,) segments, most expensive first; rank: (k,), from 1."""
 
     order: Ints
     rank: Ints

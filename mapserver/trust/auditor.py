@@ -145,7 +145,7 @@ class Auditor:
         }
 
     def _from_pool(self, maps: Sequence[ComparedMap], suspected: Sequence[bool]) -> Iterator[Difference | None]:
-        """From all others in good standing, pooled to have the most ground."""
+        """Differences from all others in good standing, pooled to have the most ground."""
         good = [each for each, bad in zip(maps, suspected, strict=True) if not bad]
         pool = ComparedMap(pooled([each.timed for each in good]), pooled([each.placed for each in good]))
         for own, bad in zip(maps, suspected, strict=True):

@@ -123,7 +123,7 @@ def _shift(one: ComparedMap, other: ComparedMap, cell_m: float, tuning: TrustTun
 def _agreement(
     one: Surface, other: Surface, b: Ints, log_gain: float, shift: Shift | None, cell_m: float, tolerance: float
 ) -> float:
-    """With or without the shift, whichever agrees more."""
+    """Agreement with or without the shift, whichever is more."""
     moves = {0}
     if shift:
         moves.add(round(shift.north_m / cell_m) * ROW + round(shift.east_m / cell_m))

@@ -73,7 +73,7 @@ class TrustDecisions:
 
 
 def _agrees(verdict: Verdict, decision: TrustDecision | None) -> bool:
-    """In all that it was excluded for; in anything, if the reason has no name."""
+    """Whether it agrees in all that it was excluded for; in anything, if the reason has no name."""
     words = decision.reason.split(", ") if decision else []
     named = {reason for reason in Reason if reason in words}
     return not verdict.contradicts and bool(verdict.agrees) and named <= verdict.agrees
