@@ -1,4 +1,4 @@
-"""Map queries answered: pages come from whoever has the map, layers are derived here, on the asking thread."""
+"""Answers to map queries: pages come from a source, layers are derived here."""
 
 from __future__ import annotations
 
@@ -63,16 +63,16 @@ from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
 from protocol.site.geometry import MAX_CELLS, Bounds, CellWindow, GridGeometry
 
-# Of a search as much of the budget as lets four wait or be in work.
+# of a search: a quarter of the budget
 BYTES = {Size.SMALL: 16_384, Size.PIECE: PIECE_BYTES, Size.SEARCH: 2**23}
-# Counters of `info`: blocks and squares whose layers were kept from an earlier query, and were derived for one.
+# counters of `info`: blocks and squares with layers from the cache, and derived ones
 LAYERS_KEPT, LAYERS_DERIVED = "layers_kept", "layers_derived"
-ROADS_MADE, ROADS_MADE_MS = "roads_made", "roads_made_ms"  # road maps of now, and how long that took
-WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
+ROADS_MADE, ROADS_MADE_MS = "roads_made", "roads_made_ms"  # present road maps, and their total time
+WITHOUT_DIFFERENCE = ("heading",)  # axes, which are periodic in half a turn
 
 
 class Answers:
-    """Answers the queries of one map, from any thread."""
+    """Answers the queries of one map. Thread-safe."""
 
     def __init__(self, source: MapSource) -> None:
         self._source = source
@@ -82,7 +82,7 @@ class Answers:
         self._open = OpenRegions()
         self._roads = RoadMaps(source)
         self._tiles = Tiles(source, self._layers, self._roads.lately)
-        self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
+        self._past_tiles: TilesAnswer | None = None  # the last ones, which readers fetch in pieces
         self._answers: dict[type[MapQuery[Any]], Callable[[Any], Any]] = {
             PointQuery: self.point,
             PointsQuery: self.points,
@@ -121,7 +121,7 @@ class Answers:
         return PastMaps(self._source.location, self._source.past, self._config)
 
     def size(self, query: MapQuery[Any]) -> int:
-        """About how many bytes the answer has, with what it takes to make it."""
+        """Approximate size of the answer and its making [bytes]."""
         if not isinstance(query, RegionQuery):
             return BYTES[query.size]
         window, _ = self._window(query)
@@ -129,19 +129,19 @@ class Answers:
         return min(PIECE_BYTES, 4 * window.columns * window.rows * layers + BYTES[Size.SMALL])
 
     def answer(self, query: MapQuery[Any]) -> bytes:
-        """Answer one query; QueryError says what is wrong with it."""
+        """Answer one query; QueryError if it is wrong."""
         check_on_site(query, self._site, lambda: self._source.run(lambda state: state.grid.bounds()))
         if query.after and _reads_roads(query):
             self._roads.reach(query.after)
         return query.encode(self._answers[type(query)](query))
 
     def machines(self, _: MachinesQuery) -> MachinesAnswer:
-        """What is known of each machine."""
-        rows: Any = self._source.machines()  # tables of the fields of their records
+        """State of each machine."""
+        rows: Any = self._source.machines()  # tables with the fields of their records
         return MachinesAnswer(tuple(rows), self._version())
 
     def changes(self, query: ChangesQuery) -> ChangesAnswer:
-        """Changes of the ground, as many as one answer has."""
+        """Changes of the ground, up to an answer's limit."""
         return ChangesAnswer(tuple(self._source.changes(query.after_id)[: codec.MAX_CHANGES]), self._version())
 
     def info(self) -> dict[str, Any]:
@@ -185,7 +185,7 @@ class Answers:
         return PointsAnswer(x_m, y_m, layers, version, look.stamp_ns)
 
     def region(self, query: RegionQuery) -> Region:
-        """Layers of all cells of an area, or of the first piece of them: `piece` has the others."""
+        """Layers of an area, or its first piece; `piece` has the others."""
         (window, count), names = self._window(query), _names(query)
         if window.columns * window.rows * count**2 > MAX_CELLS:
             problem = (
@@ -203,11 +203,11 @@ class Answers:
         return self._piece(reading, pieces, 0, self._open.open(reading))
 
     def piece(self, query: PieceQuery) -> Region:
-        """One more piece of a region that is open."""
+        """Another piece of an open region."""
         return self._piece(*self._open.reading(query.cursor, query.number), query.number, query.cursor)
 
     def history(self, query: HistoryQuery) -> HistoryAnswer:
-        """Layers of the cell that a position lies in, span by span."""
+        """Layers of a cell by span of time."""
         names = _of_cells(query.layers)
         now_ns, facts = self._source.run(lambda state: (state.newest_ns, state.facts))
         span_s = query.span_s or self._config.fold.bucket_s
@@ -218,7 +218,7 @@ class Answers:
         return HistoryAnswer(x_m, y_m, self._spans(past, names), version, now_ns)
 
     def tiles(self, query: TilesQuery) -> TilesAnswer:
-        """Tiles of the map as it is, or of all of it as of a time."""
+        """Tiles of the present or a past map."""
         if query.as_of_ns is None:
             return self._tiles.answer(query)
         fact = self._source.run(lambda state: state.version.fact)
@@ -236,7 +236,7 @@ class Answers:
         return tiles_of(view, self._layers)
 
     def why(self, query: WhyQuery) -> CellReasons:
-        """Everything that is known of the cell that a position lies in."""
+        """All that is known of a cell."""
         window = self._cell(query.x_m, query.y_m)
         if query.repairs:
             view = self._roads.view(window, self._reach, query.as_of_ns)
@@ -246,18 +246,18 @@ class Answers:
         return reasons(view, (window.column, window.row), names, self._site.cell_m, self._config)
 
     def coverage(self, query: CoverageQuery) -> Coverage:
-        """How much ground is driven and known."""
+        """Driven and known ground."""
         names = self._source.run(_names_in)
         view, window = self._known(query.bounds, query.as_of_ns)
         return coverage(view, window, names, self._site.cell_m, self._config)
 
     def lanes(self, query: LanesQuery) -> LanesAnswer:
-        """Where machines drove, by heading."""
+        """Metres driven by heading."""
         view, window = self._known(query.bounds)
         return read_lanes(view, window, query.since_ns, self._site.cell_m, self._config)
 
     def _known(self, bounds: Bounds | None, as_of_ns: int | None = None) -> tuple[View, CellWindow | None]:
-        """All that is known of a rectangle, None for all of the map, and its cells; refused where that is too much."""
+        """View and cells of a rectangle, or the whole map; refuses too much."""
         window = self._site.geometry.window(bounds) if bounds else None
         west, south, east, north = self._source.run(lambda state: state.grid.bounds()) or (0, 0, 1, 1)
         area = window or CellWindow(west, south, east - west, north - south)
@@ -272,7 +272,7 @@ class Answers:
         return CellWindow(window.column, window.row, 1, 1)
 
     def _window(self, query: RegionQuery) -> tuple[CellWindow, int]:
-        """The cells of an answer, and how many of the map each has to a side."""
+        """The answer's cells, and map cells to a side."""
         count = cells_to_a_side(query.resolution_m, self._site.cell_m)
         return GridGeometry(count * self._site.cell_m).window(query.bounds), count
 
@@ -283,7 +283,7 @@ class Answers:
     def _look_at_cells(
         self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
     ) -> tuple[dict[str, Floats32], Look]:
-        """Layers (n,) of cells (n, 2), columns and rows, and what they were read from."""
+        """Layers (n,) of cells (n, 2) [column, row], and their source."""
         if as_of_ns is None:
             look = self._now(lambda state: self._layers.look_cells(state, cells, names), repairs=repairs)
         else:
@@ -295,7 +295,7 @@ class Answers:
     def _look_at_squares(
         self, squares: Set[Block], names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
     ) -> Look:
-        """What layers of areas are read from in these squares."""
+        """Sources of area layers in squares."""
         if as_of_ns is None:
             return self._now(lambda state: self._layers.look_squares(state, squares, names), repairs=repairs)
         return self._look(around_squares(squares), names, as_of_ns, repairs=repairs)
@@ -309,14 +309,14 @@ class Answers:
         return self._layers.look_at(self._view(wide, as_of_ns))
 
     def _now(self, look: Callable[[MapState | StillMap], Look], *, repairs: bool) -> Look:
-        """Look at the map as it is; repairs: with the ages of roads, at the version that the newest of these are of."""
+        """Look at the present map; repairs: at that of the newest roads, with their ages."""
         return look(self._roads.read().still) if repairs else self._source.run(look)
 
     def _piece(self, reading: RegionReading, pieces: PieceGrid, number: int, cursor: int) -> Region:
         return replace(self._read(reading, pieces.piece(number)), piece=pieces.place(number, cursor))
 
     def _read(self, reading: RegionReading, window: CellWindow) -> Region:
-        """Layers of a window in that of the reading."""
+        """Layers of a window inside the reading's."""
         fine = finer(window, reading.count)
         newer, *others = (self._map(look, reading.layers, fine) for look in reading.looks)
         layers, version = dict(newer.layers), newer.version
@@ -365,12 +365,12 @@ class Answers:
 
 
 def _names_in(state: MapState) -> list[str]:
-    """Machines whose samples may be in the map."""
+    """Machines in the map."""
     return [name for name in state.machines() if name not in state.facts.excluded]
 
 
 def _reads_roads(query: MapQuery[Any]) -> bool:
-    """Whether an answer is of roads as they are now."""
+    """Whether an answer depends on present roads."""
     match query:
         case RoadQuery():
             return query.as_of_ns is None
@@ -388,7 +388,7 @@ def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _names(query: PointQuery | PointsQuery | RegionQuery) -> tuple[str, ...]:
-    """The layers of a query, checked; none means all, or all of which there is a difference, or a mean."""
+    """Checked layers of a query; none means all, if possible with a difference or mean."""
     without: tuple[str, ...] = ()
     if query.minus_ns is not None:
         without = WITHOUT_DIFFERENCE
@@ -405,7 +405,7 @@ def _refuse_any(names: tuple[str, ...], without: tuple[str, ...], problem: str) 
 
 
 def _time_of(query: HistoryQuery, now_ns: int, span_s: float) -> tuple[int, int]:
-    """First and last stamp of a history; refuses too many spans before any is folded."""
+    """First and last stamp of a history; refuses too many spans in advance."""
     span_ns = round(span_s * 1e9)
     to_ns = query.to_ns or max(now_ns, query.from_ns or 1)
     from_ns = query.from_ns or max(1, (to_ns // span_ns - MAX_SPANS + 1) * span_ns)

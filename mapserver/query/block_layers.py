@@ -1,12 +1,11 @@
-"""Layers of the map as it is, block by block, kept for all queries until what they are derived from is another.
+"""Layers of the present map, cached by block for all queries while their dependencies are unchanged.
 
-A layer of a cell depends on the pages of its block, and, since a change of the ground is seen with its surroundings, on
-those of the blocks around; a layer of an area on the cells around it besides. The grid numbers its turns and knows the
-last one of each block, so what nothing was folded into or near to is read as it is kept. Near to it, it is looked
-which pages count now, which are seldom others: a block is derived again only where its own pages are others, or other
-ones of them count, and a square only where a block was. Layers of areas are derived square by square, of some blocks
-each: the same bits for whoever asks, for whatever window. Where the ground of a road changed, they depend on its age
-besides: what is read with ages and without has all other blocks in common.
+Cell layers depend on the pages of their block and of those around, because changes of the ground need context; area
+layers also on cells around. The grid knows each block's last turn, so blocks without new evidence nearby are read from
+the cache. The validity of neighbouring pages is checked on every read, but rarely changes: a block is recomputed only
+if its own pages, or their validity, changed, a square only if a block was. Area layers are computed by square, hence
+the same for any window, bit for bit. On changed roads layers also depend on ages; other blocks are shared by reads with
+and without.
 """
 
 from __future__ import annotations
@@ -35,16 +34,16 @@ from protocol.arrays import AnyArray, Floats, Floats32, Ints
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-MOST_KEPT = 98_304  # layers of blocks, 1 KB each: seven layers of a site of 1.9 x 1.9 km that is driven all over
-SQUARE = 4  # blocks to a side: larger squares cost less in all, and more where little came in
+MOST_KEPT = 98_304  # layers of blocks, 1 KB each: seven of a fully driven site of 1.9 x 1.9 km
+SQUARE = 4  # blocks to a side; larger squares cost less in total, more for little new evidence
 SQUARE_CELLS = SQUARE * BLOCK_CELLS
-SQUARES_AT_ONCE = 64  # of which layers of cells are held: 1000 blocks, some 20 MB
-MOST_IMAGE = 2**20  # blocks, 8 MB: 16 x 16 km with cells of 1 m
+SQUARES_AT_ONCE = 64  # whose cell layers are in memory: 1000 blocks, some 20 MB
+MOST_IMAGE = 2**20  # blocks, 8 MB: 16 x 16 km with 1 m cells
 NEVER = -1  # turn of a block without evidence
-# These follow from stamps and the site's now; the stamps are kept.
+# layers that follow from cached stamps and the site's now
 TIMED = {"age_s": "newest_ns", "changed_s": "changed_ns"}
 Layers = Mapping[str, AnyArray]  # (256,) each, or of a square
-# What layers depend on: the last turn of the grid of all blocks that they do, and the ages there.
+# Dependencies of layers: last turn of all blocks they depend on, and ages there.
 State = tuple[int, bytes]
 NO_AGES = b""
 
@@ -65,11 +64,10 @@ class Kept:
 
 @dataclass(frozen=True)
 class Look:
-    """What a window's layers are read from, of one version of the map: layers that are kept, and pages of the others.
+    """Sources of a window's layers in one map version: cached layers, and pages of the rest.
 
-    cells, areas: what is kept of blocks and of squares, in these states or older ones; cell_states: of all blocks with
-    evidence, area_states: of all squares that have or are near any. turns: own ones of blocks, whatever is around.
-    pages: of the blocks whose layers of cells are not kept in their state, and of those around. ages: as in View.
+    cells, areas: cached, in these states or older; cell_states, area_states: of blocks with evidence, and squares near
+    any. turns: of blocks alone. pages: of blocks without valid layers, and around. ages: as in View.
     """
 
     version: MapVersion
@@ -85,10 +83,10 @@ class Look:
 
 
 class BlockLayers:
-    """Layers of one map. `look` on the thread that has the map; `read` on any, as often as wanted."""
+    """Layers of one map. `look` on the map's thread; `read` on any, repeatedly."""
 
     def __init__(self, cell_m: float, config: ServerConfig, most: int = MOST_KEPT) -> None:
-        """most: layers of blocks that are kept."""
+        """most: cached layers of blocks."""
         self.cell_m, self._config, self._most = cell_m, config, most
         self._reach = reach_blocks(cell_m, config.change)
         self._lock = threading.Lock()
@@ -97,15 +95,15 @@ class BlockLayers:
         self._count = 0  # layers of blocks in both
         self._grid: ReferenceType[Grid] | None = None
         self._numbers = count()
-        self.used, self.derived = 0, 0  # blocks and squares whose layers were kept, and had to be derived
+        self.used, self.derived = 0, 0  # blocks and squares from the cache, and derived ones
 
     def look(self, state: MapState | StillMap, window: CellWindow, names: Sequence[str]) -> Look:
-        """What these layers of a window are read from."""
+        """Sources of these layers of a window."""
         area_names, inner = _areas_of(names), _blocks_of(window)
         return self._look(state, inner, _stored(names), squares_of(window) if area_names else set(), area_names)
 
     def kept_cell(self, state: MapState, cell: Block, names: Sequence[str]) -> dict[str, float] | None:
-        """Layers of a cell, column and row, of the map as it is, where all of them are kept: a look for most points."""
+        """Layers of a cell (column, row) of the present map, if all are cached, as for most points."""
         (column, row), n = cell, BLOCK_CELLS
         block = column // n, row // n
         turn = max(state.grid.last_turns(around(block, self._reach)))
@@ -119,15 +117,15 @@ class BlockLayers:
         return {name: float(kept.layers[name][at]) for name in names}
 
     def look_squares(self, state: MapState | StillMap, squares: Set[Block], names: Sequence[str]) -> Look:
-        """What layers of areas are read from in these squares."""
+        """Sources of area layers in squares."""
         return self._look(state, _blocks_of(around_squares(squares)), (), squares, tuple(names))
 
     def look_cells(self, state: MapState | StillMap, cells: Ints, names: Sequence[str]) -> Look:
-        """What these layers of cells (n, 2), columns and rows, are read from."""
+        """Sources of these layers of cells (n, 2) [column, row]."""
         return self.look_blocks(state, _blocks_with(cells), names)
 
     def look_blocks(self, state: MapState | StillMap, blocks: Set[Block], names: Sequence[str]) -> Look:
-        """What these layers of blocks are read from, those of areas in the squares that have any of them."""
+        """Sources of these layers of blocks, and of area layers in their squares."""
         area_names = _areas_of(names)
         squares = {(x // SQUARE, y // SQUARE) for x, y in blocks} if area_names else set[Block]()
         (left, bottom), (right, top) = (
@@ -145,7 +143,7 @@ class BlockLayers:
         area_names: tuple[str, ...],
         only: Set[Block] | None = None,
     ) -> Look:
-        """Layers of cells in a rectangle of blocks, or in some of it only, and of areas in squares that touch it."""
+        """Cell layers in a rectangle of blocks, or in some; area layers in squares that touch it."""
         grid, margin = state.grid, self._margin(area_names)
         ages = state.ages if isinstance(state, StillMap) else {}
         owner = grid.grid if isinstance(grid, StillGrid) else ref(grid)
@@ -164,7 +162,7 @@ class BlockLayers:
         else:
             cell_states, area_states = _unmarked(cell_turns), _unmarked(area_turns)
         with self._lock:
-            if self._grid is None or self._grid() is not owner():  # a fact, or rows that are gone, bring another one
+            if self._grid is None or self._grid() is not owner():  # a fact, or lost rows, replace the grid
                 self._cells.clear()
                 self._areas.clear()
                 self._grid, self._count = owner, 0
@@ -183,7 +181,7 @@ class BlockLayers:
         return Look(state.version, state.newest_ns, cells, areas, cell_states, area_states, own, pages, owner, ages)
 
     def look_at(self, view: View) -> Look:
-        """The same of a view, of which nothing is kept: a map of the past."""
+        """Sources of a past map, without cache."""
         state: State = 0, NO_AGES
         states = {block: state for block, pages in view.pages.items() if pages}
         near = {one for block in states for one in around(block, self._margin(tuple(AREA_LAYERS)))}
@@ -192,7 +190,7 @@ class BlockLayers:
         return Look(view.version, view.stamp_ns, {}, {}, states, squares, turns, view.pages, ages=view.ages)
 
     def read(self, look: Look, window: CellWindow, names: Sequence[str]) -> dict[str, Floats32]:
-        """Layers (rows, columns) of a window within that of the look."""
+        """Layers (rows, columns) of a window inside the look's."""
         cell_names, area_names, inner = _stored(names), _areas_of(names), _blocks_of(window)
         areas = self.squares(look, squares_of(window), area_names) if area_names else {}
         blocks = _within(look.cell_states, inner) if cell_names else ()
@@ -208,7 +206,7 @@ class BlockLayers:
         return out
 
     def at_cells(self, look: Look, cells: Ints, names: Sequence[str]) -> dict[str, Floats32]:
-        """Layers (n,) of cells (n, 2), columns and rows, among those of the look."""
+        """Layers (n,) of cells (n, 2) [column, row] of the look."""
         out: dict[str, Floats32] = {name: np.full(len(cells), np.nan, np.float32) for name in names}
         parts = [at for _, at in _by_part(cells, SQUARE_CELLS)]
         for first in range(0, len(parts), SQUARES_AT_ONCE):
@@ -240,7 +238,7 @@ class BlockLayers:
         return out
 
     def squares(self, look: Look, squares: Set[Block], names: Sequence[str]) -> dict[Block, Layers]:
-        """Layers (SQUARE_CELLS, SQUARE_CELLS) of those of these squares that have or are near any evidence."""
+        """Layers (SQUARE_CELLS, SQUARE_CELLS) of squares with evidence nearby."""
         wanted = {square: state for square, state in look.area_states.items() if square in squares}
         areas = _valid(look.areas, wanted, names)
         stale = sorted(wanted.keys() - areas.keys())
@@ -259,20 +257,20 @@ class BlockLayers:
         return {square: kept.layers for square, kept in (areas | made).items()}
 
     def _origin_of(self, square: Block, cells: Mapping[Block, Kept], names: Sequence[str]) -> tuple[int, ...]:
-        """What a square is derived from: numbers of the blocks in it and around."""
+        """Numbers of the blocks that a square is derived from."""
         near = sorted(self._around([square], names))
         return tuple(cells[block].number if block in cells else NEVER for block in near)
 
     def _margin(self, names: Sequence[str]) -> int:
-        """How many blocks around one the layers of areas depend on."""
+        """Blocks around one that area layers depend on."""
         return -(-cell_layers.margin_cells(names, self.cell_m, self._config.read) // BLOCK_CELLS)
 
     def blocks(self, look: Look, asked: Iterable[Block], names: Sequence[str]) -> dict[Block, Kept]:
-        """Layers of the cells of those of these blocks that have evidence, kept or derived."""
+        """Cell layers of blocks with evidence, cached or derived."""
         blocks = {block: look.cell_states[block] for block in asked if block in look.cell_states}
         known = _some(look.cells, blocks)
         with self._lock:
-            if look.grid is not None and look.grid is self._grid:  # what was kept since, by others or another piece
+            if look.grid is not None and look.grid is self._grid:  # cached meanwhile, by other queries or pieces
                 known |= _some(self._cells, blocks)
         cells = _valid(known, blocks, names)
         missing = [block for block in blocks if block not in cells]
@@ -299,12 +297,12 @@ class BlockLayers:
         return cells | made
 
     def _around(self, squares: Iterable[Block], names: Sequence[str]) -> set[Block]:
-        """Blocks that layers of areas depend on in these squares."""
+        """Blocks that area layers in squares depend on."""
         margin = self._margin(names)
         return {block for x, y in squares for block in _all_of(_grown(_of_squares((x, y, 1, 1)), margin))}
 
     def _derive(self, square: Block, cells: Mapping[Block, Kept], names: Sequence[str]) -> Layers:
-        """Layers of an area in one square, from those of its cells and of the cells around."""
+        """Area layers in a square, from cell layers in and around it."""
         reach = cell_layers.margin_cells(names, self.cell_m, self._config.read)
         edge = SQUARE_CELLS
         wide = CellWindow(square[0] * edge - reach, square[1] * edge - reach, edge + 2 * reach, edge + 2 * reach)
@@ -323,7 +321,7 @@ class BlockLayers:
             self.used, self.derived = self.used + used, self.derived + derived
 
     def _keep(self, store: OrderedDict[Block, Kept], look: Look, made: Mapping[Block, Kept]) -> None:
-        """Keep what was derived, unless the map is another one by now; forget what was not used for longest."""
+        """Cache layers, unless the map was replaced; drops the least recently used."""
         with self._lock:
             if look.grid is None or look.grid is not self._grid:
                 return
@@ -341,17 +339,17 @@ class BlockLayers:
 
 
 def _beginning(first: Ints) -> tuple[bytes, ...]:
-    """Where the pages of a block begin to count (256,), to be compared and kept."""
+    """First valid pages of a block (256,), for comparison."""
     return (first.tobytes(),) if first.any() else ()
 
 
 def _some(kept: Mapping[Block, Kept], blocks: Iterable[Block]) -> dict[Block, Kept]:
-    """What is kept of these blocks, in whatever state."""
+    """Cached blocks, in any state."""
     return {block: kept[block] for block in blocks if block in kept}
 
 
 def _stored(names: Iterable[str]) -> tuple[str, ...]:
-    """Layers of cells as they are kept."""
+    """Cell layers as cached."""
     return tuple(dict.fromkeys(TIMED.get(name, name) for name in names if name not in AREA_LAYERS))
 
 
@@ -372,14 +370,14 @@ def _at(layers: Layers, name: str, now_ns: int) -> Floats | Floats32:
 
 
 def _unmarked(turns: Mapping[Block, int]) -> dict[Block, State]:
-    """States of blocks or squares of a map without ages."""
+    """States of blocks or squares without ages."""
     return {one: (turn, NO_AGES) for one, turn in turns.items()}
 
 
 def _marked(
     turns: Mapping[Block, int], still: StillMap, margin: int | None, near: Callable[[Block], Iterable[Block]]
 ) -> dict[Block, State]:
-    """States of blocks, or of squares with this margin. near: the blocks whose ages they depend on."""
+    """States of blocks, or of squares with a margin. near: blocks whose ages they depend on."""
     out, ages, marks = dict[Block, State](), still.ages, still.marks
     for one, turn in turns.items():
         if (mark := marks.get((margin, one))) is None:
@@ -389,7 +387,7 @@ def _marked(
 
 
 def _digest(blocks: Sequence[Block], ages: Ages) -> bytes:
-    """Stands for the ages in these blocks."""
+    """Hash of the ages in these blocks."""
     if not blocks:
         return NO_AGES
     parts = (part for block in blocks for part in (repr(block).encode(), ages[block].tobytes()))
@@ -397,7 +395,7 @@ def _digest(blocks: Sequence[Block], ages: Ages) -> bytes:
 
 
 def _valid(kept: Mapping[Block, Kept], states: Mapping[Block, State], names: Sequence[str]) -> dict[Block, Kept]:
-    """What is kept of these blocks in these states, with all of these layers; and marked as used."""
+    """Cached blocks in these states, with all these layers; marks them as used."""
     out = {}
     for block, state in states.items():
         one = kept.get(block)
@@ -415,12 +413,12 @@ Rect = tuple[int, int, int, int]
 
 
 def _blocks_with(cells: Ints) -> set[Block]:
-    """Blocks that have any of these cells (n, 2)."""
+    """Blocks of cells (n, 2)."""
     return {part for part, _ in _by_part(cells, BLOCK_CELLS)}
 
 
 def _by_part(cells: Ints, edge: int) -> list[tuple[Block, Ints]]:
-    """Squares of cells, edge to a side, and which of these cells (n, 2) lie in each."""
+    """Squares of cells, and the indices of the cells (n, 2) in each."""
     parts = cells // edge
     order = np.lexsort(parts.T)
     first = np.flatnonzero(np.append(True, (np.diff(parts[order], axis=0) != 0).any(axis=1)))
@@ -428,7 +426,7 @@ def _by_part(cells: Ints, edge: int) -> list[tuple[Block, Ints]]:
 
 
 def _parts_of(rect: Rect, edge: int) -> Rect:
-    """What a rectangle touches of larger squares, edge to a side."""
+    """The larger squares that a rectangle touches."""
     left, bottom = rect[0] // edge, rect[1] // edge
     return left, bottom, (rect[0] + rect[2] - 1) // edge - left + 1, (rect[1] + rect[3] - 1) // edge - bottom + 1
 
@@ -438,7 +436,7 @@ def _blocks_of(window: CellWindow) -> Rect:
 
 
 def squares_of(window: CellWindow) -> set[Block]:
-    """Columns and rows of the squares that a window touches."""
+    """Squares (column, row) that a window touches."""
     return set(_all_of(_squares_of(_blocks_of(window))))
 
 
@@ -454,7 +452,6 @@ def _squares_of(blocks: Rect) -> Rect:
 
 
 def _of_squares(squares: Rect) -> Rect:
-    """Their blocks."""
     return squares[0] * SQUARE, squares[1] * SQUARE, squares[2] * SQUARE, squares[3] * SQUARE
 
 
@@ -481,7 +478,7 @@ def _within(states: Mapping[Block, State], rect: Rect) -> dict[Block, State]:
 def _newest(
     own: Mapping[Block, int], wide: Rect, reach: int, margin: int, squares: Set[Block]
 ) -> tuple[dict[Block, int], dict[Block, int]]:
-    """The newest turn of each block and those around it; in and around each of these squares, where there is any."""
+    """Newest turn of each block and those around; and in and around each square, if any."""
     if _is_sparse(wide):
         cells = {block: max(own.get(one, NEVER) for one in around(block, reach)) for block in own}
         of_squares = ((square, _all_of(_grown(_of_squares((*square, 1, 1)), margin + reach))) for square in squares)
@@ -494,7 +491,7 @@ def _newest(
 
 
 def _near(own: Mapping[Block, int], missing: Set[Block], wide: Rect, reach: int) -> list[Block]:
-    """Those of its own blocks that are among missing ones, or around them."""
+    """Own blocks that are among or around missing ones."""
     if _is_sparse(wide):
         return sorted({one for block in missing for one in around(block, reach)} & own.keys())
     _, image = _image(dict.fromkeys(missing, 0), wide)
@@ -504,12 +501,12 @@ def _near(own: Mapping[Block, int], missing: Set[Block], wide: Rect, reach: int)
 
 
 def _is_sparse(rect: Rect) -> bool:
-    """Whether an image of a rectangle costs more than looking at its blocks one by one: places that lie far apart."""
+    """Whether an image would be too large: places far apart."""
     return rect[2] * rect[3] > MOST_IMAGE
 
 
 def _image(turns: Mapping[Block, int], rect: Rect) -> tuple[tuple[Ints, Ints], Floats]:
-    """Turns of blocks in a rectangle as an image (rows, columns), NEVER elsewhere; and where in it they are."""
+    """Turns of blocks as an image (rows, columns), NEVER elsewhere; and their places in it."""
     places = np.array(list(turns), np.int64).reshape(-1, 2) - rect[:2]
     at, image = (places[:, 1], places[:, 0]), np.full((rect[3], rect[2]), float(NEVER))
     image[at] = list(turns.values())
@@ -517,13 +514,13 @@ def _image(turns: Mapping[Block, int], rect: Rect) -> tuple[tuple[Ints, Ints], F
 
 
 def _spread(image: Floats, reach: int) -> Floats:
-    """The newest turn of each block and of those around it."""
+    """Newest turn of each block and those around."""
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.dilate(image, square, borderValue=NEVER), np.float64)
 
 
 def _by_square(image: Floats, rect: Rect, squares: Set[Block]) -> dict[Block, int]:
-    """The newest turn in each of these squares, where there is one; all of them lie in the rectangle."""
+    """Newest turn in each square of the rectangle, if any."""
     first_x, first_y = -rect[0] % SQUARE, -rect[1] % SQUARE
     rows, columns = (image.shape[0] - first_y) // SQUARE, (image.shape[1] - first_x) // SQUARE
     whole = image[first_y : first_y + rows * SQUARE, first_x : first_x + columns * SQUARE]

@@ -1,9 +1,8 @@
-"""Tiles of the map as it is, made again where evidence came in; and of the map as of any time.
+"""Tiles of the present map, remade where evidence arrives, and of past maps.
 
-A tile is one square of layers (block_layers.py), so it is another one where one of its blocks is. It is a function of
-the evidence and of the ages of roads: the age of a cell is counted from the tile's newest sample, so that time alone
-changes no tile. Ages of roads are those of some seconds ago, as a page asks ten times a second; they enter together
-with new rows, which readers ask for.
+A tile is a square of layers (block_layers.py), a function of evidence and road ages. Ages of cells count from its
+newest sample, so time alone changes no tile. Road ages are seconds old, because pages ask ten times a second, and enter
+with new rows.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ NOTHING: Numbers = (NEVER,) * SQUARE**2
 
 
 class Tiles:
-    """Tiles of the map as it is; for any thread. What it costs is for what changed since somebody last asked."""
+    """Tiles of the present map; thread-safe. Costs depend on changes since the last query."""
 
     def __init__(self, source: MapSource, layers: BlockLayers, ages: Callable[[], Ages]) -> None:
-        """ages: since when cells of roads are as they are, lately."""
+        """ages: recent ages of road cells."""
         self._source, self._layers, self._lately = source, layers, ages
         self._cell_m = source.site.cell_m
         self._reach = reach_blocks(self._cell_m, source.config.change)
@@ -147,7 +146,7 @@ def _is_newer(tile: MapTile, since: MapVersion | None) -> bool:
 
 
 def cut(answer: TilesAnswer, place: Place | None) -> TilesAnswer:
-    """What of an answer fits into one reply, from a place on: readers are never sent more than they ask for."""
+    """As much of an answer as one reply holds, from a place on."""
     tiles = sorted((tile for tile in answer.tiles if place is None or (tile.x, tile.y) >= place), key=_place)
     ends = np.cumsum([len(tile.planes) + TILE_HEAD_BYTES for tile in tiles])
     fit = max(1, int(np.searchsorted(ends, PIECE_BYTES, side="right")))

@@ -1,4 +1,4 @@
-"""Routes answered: what a drive along a line costs, and which line costs least, on the map as it is or was."""
+"""Answers about routes: a drive along a line, and the line of least cost."""
 
 from __future__ import annotations
 
@@ -26,26 +26,25 @@ from protocol.queries.routing import RouteAnswer, RouteMachine
 from protocol.site.geometry import Bounds, CellWindow
 from protocol.units import GRAVITY_MPS2
 
-EDGE_M = 20.0  # so far beyond the known ground a way may lead: around its corners
-# A way is looked for within the known ground, and no further from a rectangle around its ends than half of their
-# distance, and this: a detour that leads further away costs more than most ground between.
+EDGE_M = 20.0  # metres beyond known ground that a way may use, around corners
+# A way stays in known ground, and this plus half the distance of its ends around them: longer detours rarely pay.
 DETOUR = 0.5
 LEAST_DETOUR_M = 60.0
-MAX_CELLS = 1_000_000  # of the window of a way: 1 x 1 km, searched in about a second, with 300 MB
-# Of 64 x 64 cells with known ground: 49 km straight on; 120 KB each, and as much while they are read.
+MAX_CELLS = 1_000_000  # of a way's window: 1 x 1 km, about a second, 300 MB
+# of 64 x 64 cells with known ground: 49 km straight; 120 KB each, twice while read
 MOST_SQUARES = 768
 GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled", "visits")
 
 
 class Routes:
-    """Answers of one map; for any thread. look: at squares, now or as of a time, with the ages of roads or without."""
+    """Answers about routes of one map; thread-safe. look: at squares, at a time, with or without road ages."""
 
     def __init__(self, source: MapSource, layers: BlockLayers, look: Callable[..., Look]) -> None:
         self._source, self._layers, self._look = source, layers, look
         self._site, self._machines = source.site, NamedMachines(source)
 
     def route(self, query: RouteQuery) -> RouteAnswer:
-        """What a drive along a line costs."""
+        """Cost of a drive along a line."""
         machine = self._machines.resolve(query.machine, query.as_of_ns)
         line = np.array(query.line)
         places = steps(line, STEP_M).position_m
@@ -59,7 +58,7 @@ class Routes:
         return self._answer(query, machine, line, look, read, Prices(read, _given(query)))
 
     def way(self, query: WayQuery) -> RouteAnswer:
-        """The line that costs least, and what it costs."""
+        """The line of least cost, and its cost."""
         machine, window = self._machines.resolve(query.machine, query.as_of_ns), self._window(query)
         touched = squares_of(window)
         look, read = self._read(touched, query, lambda read: bare(read, touched))
@@ -79,9 +78,9 @@ class Routes:
     def _cheapest(
         self, query: WayQuery, lines: Sequence[Floats], driven: Callable[[Floats], RouteAnswer]
     ) -> RouteAnswer:
-        """The line that the drive costs least over, which stops and takes curves: cells know nothing of either.
+        """The line with the cheapest drive, which, unlike the search, stops and takes curves.
 
-        driven: over a line. QueryError as of the first, where no drive is possible over any.
+        driven: over a line. QueryError of the first if none is possible.
         """
         answers, problems = [], []
         for line in lines:
@@ -112,7 +111,7 @@ class Routes:
         return "nearer than `margin` to what no way leads over"
 
     def _limit(self, query: WayQuery, terrain: CostField, known: Bools, start: Cell, end: Cell) -> str:
-        """Which limit has to give so that there is a way."""
+        """The limit that prevents a way."""
         window = CellWindow(0, 0, *terrain.is_open.shape[::-1])
         for name, eased in (
             ("margin", replace(query, margin_m=0.0, avoid=())),
@@ -147,9 +146,9 @@ class Routes:
     def _read(
         self, squares: Set[Block], query: LineQuery, unpriced: Callable[[Squares], Set[Block]]
     ) -> tuple[Look, Squares]:
-        """Layers of squares, and of those around the ones with ground to price, which are known once they are read.
+        """Layers of squares, and of those around unpriced ground, once that is known.
 
-        All of one version of the map: what is read again is kept, unless something came in.
+        All of one map version: repeated reads are cached, unless samples arrive.
         """
         wanted = set(squares)
         while True:
@@ -171,7 +170,7 @@ class Routes:
     def _terrain(
         self, query: WayQuery, machine: RouteMachine, window: CellWindow, read: Squares, prices: Prices
     ) -> tuple[CostField, Bools]:
-        """Ground of a window, open everywhere, and which cells of it are known."""
+        """Ground of a window, all open, and its known cells."""
         resistance, east, north, visits = (_in_window(read, name, window) for name in GROUND)
         known = np.isfinite(resistance) | np.isfinite(visits)
         if prices.given is None and not known.any():
@@ -188,7 +187,7 @@ class Routes:
         return CostField(resistance.astype(np.float64), east_m, north_m, is_open, self._site.cell_m, crawl), known
 
     def _window(self, query: WayQuery) -> CellWindow:
-        """Where a way is looked for."""
+        """The window searched for a way."""
         ends = np.array([query.start, query.end])
         reach = LEAST_DETOUR_M + DETOUR * math.dist(query.start, query.end)
         low, high = ends.min(axis=0) - reach, ends.max(axis=0) + reach
@@ -209,7 +208,7 @@ class Routes:
 
 
 def _given(query: LineQuery) -> float | None:
-    """What the query says that unknown ground costs."""
+    """The query's price of unknown ground, or None."""
     return None if isinstance(query.unknown, str) else query.unknown
 
 
@@ -222,7 +221,7 @@ def _in_window(squares: Squares, name: str, window: CellWindow) -> Floats32:
 
 
 def _open(terrain: CostField, known: Bools, query: WayQuery, window: CellWindow, cell_m: float) -> Bools:
-    """Over which cells a way may lead."""
+    """Cells over which a way may lead."""
     is_open = _steepness(terrain) <= query.max_grade
     if query.unknown == REFUSE:
         is_open &= known
@@ -245,7 +244,7 @@ def _refusal(problem: str) -> QueryError:
 
 
 def warm_up() -> None:
-    """Compile the kernels of routes, or read them from their cache, before somebody who asks waits for them."""
+    """Compile the kernels of routes, or load them, before a query waits for them."""
     resistance, level = np.full((8, 8), 0.02), np.zeros((8, 8))
     terrain = CostField(resistance, level, level, resistance > 0, 1.0)
     least_cost_line(terrain, (0, 0), (7, 5))

@@ -1,4 +1,4 @@
-"""Views: evidence of a window of cells as it is now, or as of any time, and the layers that are read from it."""
+"""Views: evidence of a window now or in the past, and its layers."""
 
 from __future__ import annotations
 
@@ -32,13 +32,12 @@ from protocol.queries.answers import MapVersion
 from protocol.queries.lanes import LanesAnswer
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-# Of known ground that one question may read, 4 km2 with cells of 1 m: looking at them takes whoever owns the map 0.2 s,
-# and pages of the past up to 190 MB.
+# Blocks of known ground per query, 4 km2 with 1 m cells: 0.2 s of the map's owner, up to 190 MB of past pages.
 MOST_BLOCKS = 16_384
 
 
 def check_past(state: MapState, window: CellWindow | None, reach: int) -> None:
-    """Refuse a map of the past of too much known ground; window: None for all of it. On the thread that has the map."""
+    """Refuse a past map of too much known ground; window: None for all. On the map's thread."""
     west, south, east, north = state.grid.bounds() or (0, 0, 1, 1)
     area = CellWindow(west, south, east - west, north - south) if window is None else surroundings(window, reach)
     instead = "of the past ask for a `region` of a part, with `bounds` and `as_of`; or ask for the map as it is"
@@ -46,7 +45,7 @@ def check_past(state: MapState, window: CellWindow | None, reach: int) -> None:
 
 
 def check_blocks(count: int, instead: str) -> None:
-    """Refuse a question that reads too much known ground, and say what to ask instead."""
+    """Refuse a query of too much known ground, with advice."""
     if count > MOST_BLOCKS:
         n = BLOCK_CELLS
         problem = f"it reads {count} blocks ({n} x {n} cells) of known ground, over {MOST_BLOCKS}"
@@ -55,10 +54,9 @@ def check_blocks(count: int, instead: str) -> None:
 
 @dataclass(frozen=True)
 class View:
-    """Pages of a window's blocks and of those around them: a change is seen with its surroundings.
+    """Pages of a window's blocks and those around.
 
-    version: of the map that they are of. stamp_ns: the time that they are as of. ages: of ground whose change is known
-    otherwise.
+    version: of their map. stamp_ns: their time. ages: of ground with changes known otherwise.
     """
 
     pages: Pages
@@ -69,7 +67,7 @@ class View:
 
 @dataclass(frozen=True)
 class StillGrid:
-    """What a grid had in one of its turns, read as the grid itself. turns: of all blocks; grid: whose they are."""
+    """A grid's content in one turn, read like a grid. turns: of all blocks; grid: its source."""
 
     all_pages: Pages
     turns: Mapping[Block, int]
@@ -101,9 +99,9 @@ class StillGrid:
 
 @dataclass(frozen=True)
 class StillMap:
-    """A version of the map with the ages that changes of roads give, of now or as it was. newest_ns: as in MapState.
+    """A map version, present or past, with ages from changed roads. newest_ns: as in MapState.
 
-    marks: what stands for the ages in and near a block or square, kept by who reads it.
+    marks: hashes of ages by block or square, cached by readers.
     """
 
     grid: StillGrid | Grid
@@ -115,14 +113,14 @@ class StillMap:
 
 @dataclass(frozen=True)
 class PastMaps:
-    """Maps of one store as of any time. Every call opens the journal anew, so that any thread may ask."""
+    """Past maps of one store. Each call opens the journal, so it is thread-safe."""
 
     journal: JournalLocation
     past: StorePast
     config: ServerConfig
 
     def view(self, window: CellWindow, stamp_ns: int, facts: Facts) -> View:
-        """The map from samples stamped so or earlier; journal rows that are committed meanwhile may be in it."""
+        """The map from samples stamped up to stamp_ns, possibly with rows committed meanwhile."""
         reach = reach_blocks(self.past.cell_m, self.config.change)
         with self._reader(facts) as (reader, version):
             grid = self.past.grid_as_of(reader, stamp_ns, surroundings(window, reach), facts)
@@ -131,7 +129,7 @@ class PastMaps:
     def history(
         self, cell: tuple[int, int], times: tuple[int, int], span_ns: int, facts: Facts
     ) -> tuple[CellHistory, MapVersion]:
-        """Evidence of a cell (column, row) from the first to the last of the times [ns], span by span."""
+        """Evidence of a cell (column, row) by span between two times [ns], inclusive."""
         with self._reader(facts) as (reader, version):
             return cell_history(self.past, reader, cell, span_ns, Selection.by(facts, *times)), version
 
@@ -145,20 +143,20 @@ class PastMaps:
 
 
 def view_now(state: MapState, window: CellWindow) -> View:
-    """The map as it is, on the thread that has it."""
+    """The present map, on its thread."""
     reach = reach_blocks(state.site.cell_m, state.config.change)
     return View(_pages(state.grid, window, reach), state.version, state.newest_ns)
 
 
 def view_of(grid: Grid, window: CellWindow, config: ServerConfig) -> View:
-    """The map that a grid makes, without a journal."""
+    """The map of a grid, without a journal."""
     return View(_pages(grid, window, reach_blocks(grid.cell_m, config.change)), MapVersion("", 0, 0), grid.newest_ns)
 
 
 def read_cells(
     view: View, window: CellWindow, names: tuple[str, ...], cell_m: float, config: ServerConfig
 ) -> dict[str, Floats32]:
-    """Layers of cells (rows, columns) of a window."""
+    """Layers (rows, columns) of a window."""
     first = valid_pages(view.pages, cell_m, config.change, view.ages)
     shape = (window.rows, window.columns)
     out: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in names}
@@ -173,7 +171,7 @@ def read_cells(
 def read_lanes(
     view: View, window: CellWindow | None, since_ns: int | None, cell_m: float, config: ServerConfig
 ) -> LanesAnswer:
-    """Squares that a window touches, None for all of the view. since_ns: those with newer samples alone."""
+    """Lanes of the blocks in a window, or all (None). since_ns: only those with newer samples."""
     first = valid_pages(view.pages, cell_m, config.change, view.ages)
     blocks = [block for block in sorted(view.pages) if window is None or _touches(block, window)]
     tiles = (lane_tile(block, view.pages[block], first[block], view.stamp_ns) for block in blocks)
@@ -192,7 +190,7 @@ def place(out: Floats32, window: CellWindow, block: Block, values: AnyArray) -> 
 
 
 def widened(window: CellWindow, cells: int) -> CellWindow:
-    """A window with so many cells more on each side."""
+    """A window, wider by so many cells on each side."""
     return CellWindow(window.column - cells, window.row - cells, window.columns + 2 * cells, window.rows + 2 * cells)
 
 
@@ -202,7 +200,7 @@ def _pages(grid: Grid, window: CellWindow, reach: int) -> Pages:
 
 
 def surroundings(window: CellWindow, reach: int) -> CellWindow:
-    """All cells of the blocks that a window touches, and of `reach` blocks to every side."""
+    """Cells of the blocks that a window touches, and `reach` blocks around."""
     n = BLOCK_CELLS
     left, bottom = window.column // n - reach, window.row // n - reach
     right = (window.column + window.columns - 1) // n + 1 + reach
