@@ -1,17 +1,17 @@
-"""How this processor rounds: bytes that were recorded on another one can be expected only where it rounds alike."""
+"""Rounding of this processor: recorded bytes are only reproducible where it is the same."""
 
 import hashlib
 
 import cv2
 import numpy as np
 
-ARITHMETIC = "9715b098e465175b4f20a63659fb9f9c4097a7be04f0a7e2a5d3b8211950ab71"  # where hashes of recordings were taken
+ARITHMETIC = "9715b098e465175b4f20a63659fb9f9c4097a7be04f0a7e2a5d3b8211950ab71"  # of the published hashes
 
 
 def arithmetic() -> str:
-    """Hash of how this processor rounds: numpy, OpenBLAS and OpenCV pick their kernels by what it offers.
+    """Hash of the rounding: numpy, OpenBLAS and OpenCV choose kernels by processor.
 
-    OpenBLAS also picks those that OPENBLAS_CORETYPE names: some add up the products of a vector and a matrix otherwise.
+    OPENBLAS_CORETYPE overrides the choice; some kernels sum vector-matrix products in another order.
     """
     at = np.random.default_rng(1).standard_normal(1001)
     matrix = at[:900].reshape(100, 3, 3)

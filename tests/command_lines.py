@@ -1,4 +1,4 @@
-"""All commands of the parser, a command line for each, and what a command says: in this process."""
+"""All commands of the parser, a command line for each, and their output, in this process."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sitegrid.cli import main
 from sitegrid.command_line import build_parser
 from sitegrid.options.values import OutputFile
 
-Given = dict[str, str]  # value of each option by its destination
+Given = dict[str, str]  # option values by destination
 
 
 class Command(NamedTuple):
-    """One command with its actions: the words, and the parser behind each."""
+    """A command with its actions: words, and the parser behind each."""
 
     words: tuple[str, ...]
     parsers: tuple[ArgumentParser, ...]
@@ -26,11 +26,11 @@ class Command(NamedTuple):
         return "-".join(self.words)
 
     def options(self) -> list[Action]:
-        """What the command takes; of an option that two levels have, the last."""
+        """All options; of duplicates on two levels, the last."""
         return [a for parser in self.parsers for a in parser._actions if not isinstance(a, _SubParsersAction)]
 
     def line(self, given: Given) -> list[str]:
-        """A command line with these values, and something for all that is required."""
+        """A command line with these values, and something for all required options."""
         line: list[str] = []
         for word, parser in zip(self.words, self.parsers, strict=True):
             line.append(word)
@@ -50,7 +50,7 @@ class Command(NamedTuple):
 
 
 class Said(NamedTuple):
-    """Exit code of a command, and what it wrote."""
+    """A command's exit code and output."""
 
     code: int
     out: str
@@ -58,13 +58,13 @@ class Said(NamedTuple):
 
     @property
     def json(self) -> Any:
-        """Its last line."""
+        """Parsed last line."""
         assert self.code == 0, self.err
         return json.loads(self.out.splitlines()[-1])
 
 
 def said(*words: object) -> Said:
-    """Run a command in this process, as fast as its work: what only a process of its own can do is not for it."""
+    """Run a command in this process."""
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         try:
@@ -78,7 +78,7 @@ Parsers = tuple[ArgumentParser, ...]
 
 
 def _commands(parser: ArgumentParser, words: tuple[str, ...] = (), above: Parsers = ()) -> list[Command]:
-    """All commands below a parser; the parsers of each, without the topmost."""
+    """All commands below a parser; their parsers without the topmost."""
     branches = [a for a in parser._actions if isinstance(a, _SubParsersAction)]
     if not branches:
         return [Command(words, (*above, parser))]

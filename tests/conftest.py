@@ -1,12 +1,10 @@
-"""Settings for all tests."""
-
 from __future__ import annotations
 
 import os
 import sys
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy starts them: small matrices, and tests side by side
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each process that a test starts compiles all sources
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy starts them: small matrices, parallel tests
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every child process compiles all sources
 
 import gc
 import signal
@@ -21,15 +19,14 @@ from sitegrid.process.lifetime import SIGNALS
 from tests import postgres_server as postgres
 from tests.paths import ROOT, SHARED_DATA
 
-gc.set_threshold(50_000, 50, 100)  # recorded drives are millions of objects: usual steps take a sixth of all time
+gc.set_threshold(50_000, 50, 100)  # recorded drives are millions of objects: default steps take a sixth of the time
 
-# A shell starts what it runs in the background with SIGINT ignored, nohup with SIGHUP, and so would be all processes of
-# the tests.
+# Shells start background jobs with SIGINT ignored, nohup with SIGHUP; so would all test processes.
 for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, handler)
 
-# Repeatable on every machine, and no complaint about a slow one.
+# Repeatable everywhere, tolerant of slow hosts.
 settings.register_profile(
     "repeatable", max_examples=50, derandomize=True, deadline=None, database=None, print_blob=True
 )
@@ -38,13 +35,12 @@ settings.load_profile("repeatable")
 
 @pytest.fixture(scope="session")
 def root() -> Path:
-    """The project's root."""
     return ROOT
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled_kernels() -> None:
-    """Compile Numba's kernels, or read them from their cache: no single test pays for it."""
+    """Compile or load Numba's kernels, so that no single test pays for it."""
     from tests.kernels import compile_all
 
     compile_all(from_the_end=os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0")
@@ -52,7 +48,7 @@ def _compiled_kernels() -> None:
 
 @pytest.fixture(scope="session")
 def husky_data() -> Path:
-    """The real Husky log; skipped where it is not at hand."""
+    """The real Husky log, or skip."""
     folder = SHARED_DATA / "rl_test1_husky"
     if not folder.exists():
         pytest.skip("the Husky log is not beside the project (../shared/data/rl_test1_husky)")
@@ -61,7 +57,7 @@ def husky_data() -> Path:
 
 @pytest.fixture(scope="session")
 def postgres_cluster() -> Iterator[postgres.Cluster]:
-    """A real PostgreSQL server, one for all tests of a process."""
+    """A real PostgreSQL server per test process."""
     try:
         with postgres.cluster() as cluster:
             yield cluster
@@ -76,7 +72,7 @@ def database(postgres_cluster: postgres.Cluster) -> postgres.Database:
 
 
 def pytest_report_header() -> str:
-    """Which PostgreSQL the tests use."""
+    """The PostgreSQL in use."""
     try:
         return f"PostgreSQL: {postgres.binaries()}"
     except RuntimeError as error:
@@ -85,34 +81,33 @@ def pytest_report_header() -> str:
 
 @pytest.fixture(autouse=True)
 def _at_root(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Child processes find the packages from wherever pytest was started."""
+    """Child processes find the packages from any directory."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
 
 
 @pytest.fixture(autouse=True)
 def _signals_are_put_back() -> Iterator[None]:
-    """Commands that run inside the test's process set signal handlers."""
+    """Commands run in the test's process set signal handlers."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
 
 
-# Processor time is reported and fails nothing: it doubles on a loaded machine, and a library's first use costs some.
-MOST_CPU_S = 4.0  # of a test that is not marked; `make quick` leaves out what takes longer than about half a second
+# CPU time is reported only: it doubles on a loaded host, and first use of a library costs.
+MOST_CPU_S = 4.0  # of an unmarked test; `make quick` omits those over 0.5 s
 CPU_S = "cpu_s"
 BEGAN_S, OF_WORKERS = pytest.StashKey[float](), pytest.StashKey[float]()
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Begin to count the processor time of a test."""
     item.stash[BEGAN_S] = _cpu_s()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, object, object]:
-    """Note it once what the test started is ended; what tests share is the first's, and its end the last's."""
+    """Includes teardown; shared fixtures count for the first and last test."""
     try:
         return (yield)
     finally:
@@ -120,20 +115,20 @@ def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, object, object
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Tell the process that started this one what all took, fixtures as well."""
+    """Report total CPU time, fixtures included, to the parent."""
     if (output := getattr(session.config, "workeroutput", None)) is not None:
         output[CPU_S] = _cpu_s()
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
-    """Add what a process of pytest-xdist took."""
-    taken_s = getattr(node, "workeroutput", {}).get(CPU_S, 0.0)  # none of one that crashed
+    """Add a pytest-xdist worker's time."""
+    taken_s = getattr(node, "workeroutput", {}).get(CPU_S, 0.0)  # none of a crashed one
     node.config.stash[OF_WORKERS] = node.config.stash.get(OF_WORKERS, 0.0) + taken_s
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Print what all took, and name the tests that took long and do not say so."""
+    """Print the total, and slow unmarked tests."""
     for report in terminalreporter.stats.get("", []):
         taken_s = dict(report.user_properties).get(CPU_S, 0.0)
         if taken_s > MOST_CPU_S and not {"slow", "processes", "nightly"} & report.keywords.keys():
@@ -147,7 +142,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 
 def _cpu_s() -> float:
-    """Processor time of this process, of the children that it waited for, and of forks."""
+    """CPU time of this process, its waited children, and forks."""
     times, forks = os.times(), sys.modules.get("tests.integration.forks")
     of_children_s = times.children_user + times.children_system + (forks.cpu_s() if forks else 0.0)
     return times.user + times.system + of_children_s

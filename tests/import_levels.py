@@ -1,4 +1,4 @@
-"""Levels of modules that import each other: how many stand on top of each other, and how many circles they form."""
+"""Levels and cycles of modules that import each other."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 
 
 def layering(imports: Mapping[str, Iterable[str]]) -> tuple[int, int]:
-    """How many levels modules that import each other have, a circle being one; and how many circles there are."""
+    """Number of levels, a cycle counting as one, and number of cycles."""
     known = {name: sorted(imported for imported in those if imported in imports) for name, those in imports.items()}
     circles = _circles(known)
     circle_of = {name: number for number, circle in enumerate(circles) for name in circle}
@@ -21,7 +21,7 @@ def layering(imports: Mapping[str, Iterable[str]]) -> tuple[int, int]:
 
 
 def _circles(edges: Mapping[str, Sequence[str]]) -> list[list[str]]:
-    """Strongly connected components, those below first (Tarjan 1972)."""
+    """Strongly connected components, lowest first (Tarjan 1972)."""
     order: dict[str, int] = {}
     lowest: dict[str, int] = {}
     stack: list[str] = []

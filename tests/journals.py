@@ -1,4 +1,4 @@
-"""Journals as tests look at them."""
+"""Journals in tests."""
 
 from mapserver.journal.history import History
 from mapserver.journal.location import JournalLocation
@@ -6,5 +6,5 @@ from mapserver.journal.sqlite.reader import SqliteQueries
 
 
 def history_beside(journal: SqliteQueries) -> History:
-    """A journal and the archive beside it."""
+    """A journal with its archive."""
     return History(journal, JournalLocation(journal.path.parent).archive)

@@ -1,6 +1,6 @@
-"""Numba's kernels, compiled once on a fresh clone, though several processes of tests begin at the same time.
+"""Numba's kernels, compiled once per clone although test processes start concurrently.
 
-One begins with roads and the other with the simulator's world; whoever comes second to a part reads it from the cache.
+One process starts with roads, the other with the simulator; the second one at a part loads it from the cache.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TWO = samples(2, stamp_ns=[NOW_NS, NOW_NS + 10**12], c_rr=[0.01, 0.3])
 
 
 def pages() -> Any:
-    """Of a fold, which all parts of the first half begin with."""
+    """Of a fold, the base of the first half."""
     (folded_pages,) = folded(TWO).pages([(0, 0)])
     return folded_pages
 
@@ -38,7 +38,7 @@ def world() -> None:
         idle(placed_world, 0.01)
 
 
-# The module whose kernels they are, and whether they begin with a fold.
+# Module of the kernels, whether they need a fold, and their compilation.
 PARTS: tuple[tuple[ModuleType, bool, Callable[[], object]], ...] = (
     (road_maps, True, lambda: road_maps.warm_up(FOLD)),
     (grid, True, lambda: grid.warm_up(FOLD)),
@@ -53,7 +53,7 @@ PARTS: tuple[tuple[ModuleType, bool, Callable[[], object]], ...] = (
 
 
 def compile_all(*, from_the_end: bool) -> None:
-    """Compile all kernels that a process of tests calls, or read them."""
+    """Compile or load all kernels used by tests."""
     drop_stale()
     for module, folds, compile_part in reversed(PARTS) if from_the_end else PARTS:
         if folds:
@@ -62,7 +62,7 @@ def compile_all(*, from_the_end: bool) -> None:
 
 
 def _alone(module: ModuleType, compile_part: Callable[[], object]) -> None:
-    """While no other process compiles the same."""
+    """Exclude other processes meanwhile."""
     with Path(str(module.__file__)).open("rb") as locked:
         fcntl.flock(locked, fcntl.LOCK_EX)
         compile_part()

@@ -1,4 +1,4 @@
-"""Memory of a process, as its kernel counts it."""
+"""Memory of a process from the kernel."""
 
 from __future__ import annotations
 
@@ -6,9 +6,6 @@ from pathlib import Path
 
 
 def memory_mb(name: str = "VmRSS", pid: int | None = None) -> float:
-    """Memory of this process or another: resident now, or with VmHWM the most that ever was.
-
-    getrusage would count a parent's too.
-    """
+    """Resident memory of a process, or with VmHWM its peak; getrusage would include a parent's."""
     lines = Path(f"/proc/{pid or 'self'}/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(name)) * 1024 / 1e6

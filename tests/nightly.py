@@ -1,9 +1,9 @@
-"""`python -m tests.nightly [PART ...]`: what takes too long for `make test`, part by part, each with its budget.
+"""`python -m tests.nightly [PART ...]`: what is too slow for `make test`, in parts with budgets.
 
-Without PART, all that have not passed yet: a run that was interrupted goes on, and one that has passed whole begins
-anew, as --again does. A part that fails stops no other. What each prints is in .nightly/PART.log.
+Without PART: all that have not passed yet, so an interrupted run continues; after a complete pass, and with --again,
+all start anew. Failing parts stop no others. Output: .nightly/PART.log.
 
-Exit code 0 if all parts that were asked for have passed, 1 if not, 2 for a wrong option, 130 if interrupted.
+Exit code 0 if all requested parts passed, 1 if not, 2: wrong option, 130: interrupted.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from tests.paths import ROOT
 
 FOLDER = ROOT / ".nightly"
 NIGHT_S = 45 * 60.0
-HANGS = 4  # budgets after which a part is ended: it hangs
-TIDY_S = 60.0  # that an interrupted part has to end its processes
+HANGS = 4  # budgets after which a part counts as hung
+TIDY_S = 60.0  # for an interrupted part to end its processes
 TESTS = ("pytest", "--quiet", "--numprocesses", "auto", "--dist", "worksteal", "--durations", "15")
 COMPOSE = ("tests/integration/test_compose.py", "tests/integration/test_compose_ha.py")
 FOLD = ("tests/integration/test_fold_jobs.py", "tests/unit/sitegrid/refold")
@@ -49,7 +49,7 @@ OTHERS = tuple(word for path in (*COMPOSE, *FOLD, *TAKEOVER, *FOLLOWERS) for wor
 
 @dataclass(frozen=True)
 class Part:
-    """Modules that run one after the other, each with its words. budget_s: what they may take on two quiet cores."""
+    """Modules to run with their words. budget_s: on two quiet cores."""
 
     name: str
     budget_s: float
@@ -58,7 +58,7 @@ class Part:
 
 @dataclass(frozen=True)
 class PartOutcome:
-    """How a part went. commit: of the checkout, with + where it had changes."""
+    """Result of a part. commit: of the checkout, + if modified."""
 
     name: str
     ok: bool
@@ -67,7 +67,7 @@ class PartOutcome:
 
 
 def loads(*lines: str) -> tuple[tuple[str, ...], ...]:
-    """Loads of the laboratory, in sizes that show that they work; their figures are for larger ones."""
+    """Lab loads in smoke-test sizes."""
     return tuple(("lab", "speed", *line.split()) for line in lines)
 
 
@@ -90,7 +90,7 @@ WEEKLY = (
 
 
 def main(words: Sequence[str] | None = None, parts: Sequence[Part] = (), folder: Path = FOLDER) -> int:
-    """Run parts of `parts`, or of those of the night or the week, and print a table."""
+    """Run parts, default those of the night or week, and print a table."""
     arguments = _parse(words, parts)
     chosen = parts or (WEEKLY if arguments.weekly else PARTS)
     known = {part.name: part for part in chosen}
@@ -140,7 +140,7 @@ def _run(part: Part, folder: Path) -> PartOutcome:
 
 
 def _code_of(command: Sequence[str], log: int, limit_s: float) -> int:
-    """Exit code of a module; what hangs is ended, with all that it started."""
+    """Exit code of a module; a hung one is ended with its children."""
     line = [sys.executable, "-m", *command]
     process = subprocess.Popen(line, cwd=ROOT, stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True)
     try:
@@ -154,7 +154,7 @@ def _code_of(command: Sequence[str], log: int, limit_s: float) -> int:
 
 
 def _end(process: subprocess.Popen[bytes]) -> int:
-    """By Ctrl-C, which pytest and the others answer by ending what they started; then by force."""
+    """By SIGINT, which pytest and others handle with cleanup; then by force."""
     process.send_signal(signal.SIGINT)
     try:
         process.wait(TIDY_S)

@@ -1,4 +1,4 @@
-"""Where things are that tests read."""
+"""Paths for tests."""
 
 from __future__ import annotations
 
@@ -8,4 +8,4 @@ ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "config"
 DOCS = ROOT / "docs"
 GOLDEN = ROOT / "tests" / "golden"
-SHARED_DATA = ROOT.parent / "shared" / "data"  # real logs, where they are at hand
+SHARED_DATA = ROOT.parent / "shared" / "data"  # real logs, if at hand

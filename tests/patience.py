@@ -1,7 +1,4 @@
-"""How long a test waits for what has to come: it stops a hang, and judges nothing.
-
-Long enough for a machine that does much else. Nobody waits so long in a test that passes.
-"""
+"""Timeout of waits in tests: stops hangs on busy hosts, judges nothing; passing tests never reach it."""
 
 from __future__ import annotations
 
@@ -13,5 +10,5 @@ PATIENCE_S = 300.0
 
 
 def until(is_so: Callable[[], object], what: str) -> None:
-    """Wait until something holds; a ProcessError with `what` if it never does."""
+    """Wait for a condition; ProcessError with `what` on timeout."""
     wait_until(lambda: bool(is_so()), PATIENCE_S, what)

@@ -1,4 +1,4 @@
-"""Real PostgreSQL servers in temporary folders: Debian's binaries, run as another user than root."""
+"""Real PostgreSQL servers in temporary folders: Debian's binaries, run as a non-root user."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import psycopg
 
-USER = "postgres"  # PostgreSQL refuses to run as root
+USER = "postgres"  # PostgreSQL refuses root
 SETTINGS = {
     "unix_socket_directories": "",
     "listen_addresses": "127.0.0.1",
@@ -35,7 +35,7 @@ START_S = 60.0
 
 
 def binaries() -> Path:
-    """The folder of `initdb` and `postgres`; RuntimeError says what to install."""
+    """Folder of `initdb` and `postgres`; RuntimeError says what to install."""
     folders = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: float(path.parent.name), reverse=True)
     on_path = shutil.which("postgres")
     for folder in (*folders, *([Path(on_path).parent] if on_path else [])):
@@ -45,7 +45,6 @@ def binaries() -> Path:
 
 
 def free_port() -> int:
-    """A TCP port that nobody uses."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -53,8 +52,6 @@ def free_port() -> int:
 
 @dataclass(frozen=True)
 class Database:
-    """One database of a server."""
-
     cluster: Cluster
     name: str
 
@@ -64,7 +61,7 @@ class Database:
         return self.cluster.url(self.name)
 
     def sql(self, statement: str) -> list[tuple[Any, ...]]:
-        """Run one statement as the superuser."""
+        """Run a statement as the superuser."""
         return self.cluster.sql(statement, self.name)
 
     def end_all(self) -> None:
@@ -73,14 +70,14 @@ class Database:
         self.sql(f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE {others}")  # a constant
 
     def end_writer(self) -> None:
-        """End the session that has a journal's lock, if there is one."""
+        """End the session that holds a journal's lock, if any."""
         held = "SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND granted"
         here = "database = (SELECT oid FROM pg_database WHERE datname = current_database())"
         self.sql(f"SELECT pg_terminate_backend(pid) FROM ({held} AND {here}) AS holder")  # constants
 
 
 class Cluster:
-    """One PostgreSQL server with its data. port: on 127.0.0.1; folder: has its Unix socket too."""
+    """One PostgreSQL server with data. port: on 127.0.0.1; folder: of its Unix socket too."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.data, self.port = folder, folder / "data", free_port()
@@ -89,16 +86,15 @@ class Cluster:
         self._bin = binaries()
 
     def initialise(self) -> None:
-        """Make the data."""
         self._run("initdb", "-D", self.data, "-U", USER, "-A", "trust", "-E", "UTF8", "--no-locale", "-N")
 
     def copy_of(self, primary: Cluster, name: str) -> None:
-        """Make the data of a replica, which follows with this name."""
+        """Make a replica's data; `name` identifies it."""
         source = f"host=127.0.0.1 port={primary.port} user={USER} application_name={name}"
         self._run("pg_basebackup", "-D", self.data, "-d", source, "-R", "-X", "stream", "-c", "fast")
 
     def start(self, **more: str) -> None:
-        """Start it, and wait until it answers. more: settings."""
+        """Start and wait for an answer. more: settings."""
         settings = {**SETTINGS, "unix_socket_directories": str(self.folder), "port": str(self.port), **more}
         words = [str(self._bin / "postgres"), "-D", str(self.data)]
         words += [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
@@ -116,7 +112,7 @@ class Cluster:
                 time.sleep(0.05)
 
     def stop(self, number: int = signal.SIGINT) -> None:
-        """End it: SIGINT ends all sessions, SIGKILL is a crash of its main process."""
+        """Stop: SIGINT ends sessions, SIGKILL crashes the main process."""
         if self._process:
             with suppress(ProcessLookupError):
                 self._process.send_signal(number)
@@ -128,7 +124,7 @@ class Cluster:
         self._run("pg_ctl", "promote", "-D", self.data, "-w")
 
     def shows_all_of(self, primary: Cluster) -> bool:
-        """Whether a replica's sessions see all that its primary has written: having it on disk comes before that."""
+        """Whether a replica's sessions see everything written, which comes after it is on disk."""
         written = primary.sql("SELECT pg_current_wal_lsn()")[0][0]
         return bool(self.sql(f"SELECT pg_last_wal_replay_lsn() >= '{written}'::pg_lsn")[0][0])
 
@@ -141,14 +137,13 @@ class Cluster:
         return f"postgresql://{USER}@/{database}?host={self.folder}&port={self.port}"
 
     def new_database(self) -> Database:
-        """An empty one."""
         self._databases += 1
         name = f"test_{self._databases}"
         self.sql(f"CREATE DATABASE {name}")
         return Database(self, name)
 
     def sql(self, statement: str, database: str = "postgres") -> list[tuple[Any, ...]]:
-        """Run one statement as the superuser."""
+        """Run a statement as the superuser."""
         with psycopg.connect(self.url(database), autocommit=True) as db:
             cursor = db.execute(statement)
             return cursor.fetchall() if cursor.description else []
@@ -163,7 +158,7 @@ class Cluster:
 
 @contextmanager
 def cluster(**settings: str) -> Iterator[Cluster]:
-    """A new server that runs, and goes away with its data."""
+    """A new running server, removed with its data."""
     with cluster_folder() as folder:
         made = Cluster(folder)
         made.initialise()
@@ -176,7 +171,7 @@ def cluster(**settings: str) -> Iterator[Cluster]:
 
 @contextmanager
 def replica(primary: Cluster, name: str) -> Iterator[Cluster]:
-    """A new replica of a server, which streams under this name; it goes away with its data."""
+    """A new streaming replica, removed with its data."""
     with cluster_folder() as folder:
         made = Cluster(folder)
         made.copy_of(primary, name)
@@ -189,7 +184,7 @@ def replica(primary: Cluster, name: str) -> Iterator[Cluster]:
 
 @contextmanager
 def cluster_folder() -> Iterator[Path]:
-    """A folder that the other user may use."""
+    """A folder for the other user."""
     with tempfile.TemporaryDirectory(prefix="pg-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         if os.geteuid() == 0:
@@ -198,7 +193,7 @@ def cluster_folder() -> Iterator[Path]:
 
 
 def as_user() -> dict[str, Any]:
-    """Options of a child process that must not run as root."""
+    """Child process options for a non-root user."""
     if os.geteuid():
         return {}
     user = pwd.getpwnam(USER)

@@ -1,8 +1,7 @@
-"""Days of work on a site of 1 km2: what ten machines send that drive a web of roads all day, and a store full of it.
+"""Days of work on 1 km2: samples of ten machines on a web of roads, and a store full of them.
 
-Five roads lead east and five north, 10 m wide and 1 km long: a tenth of the site. At each crossing a machine turns off
-or goes on, never back. On the way to the next one it keeps to its lane of the right-hand half of the road, and its
-position is off by one and the same error, as errors of satellite positions last for a minute.
+Five roads each way, 10 m wide, 1 km long: a tenth of the site. At crossings machines turn or go on, never back. On a
+leg a machine keeps its right-hand lane and one position error, since satellite errors last a minute.
 """
 
 from __future__ import annotations
@@ -32,26 +31,26 @@ from protocol.wire.messages import SampleBatch
 START_NS = 1_767_225_600_000_000_000
 
 MACHINES, ROADS = 10, 5  # roads in each direction
-WIDTH_M, LEG_M = 10.0, 250.0  # of a road; between two crossings
+WIDTH_M, LEG_M = 10.0, 250.0  # of a road; between crossings
 SPEED_MPS, SPACING_M = 3.0, 0.5
 STD_M = 1.2  # of a position
-HOURS = 10.0  # of a working day
-BATCH = 100  # samples that a machine sends at once
-A_SECOND = 6  # likewise, each second
+HOURS = 10.0  # working day
+BATCH = 100  # samples per batch
+A_SECOND = 6  # samples per second
 IN_ONE_COMMIT = 10_000  # journal rows of a store
 LEG_SAMPLES = int(LEG_M / SPACING_M)
 SAMPLE_NS, DAY_NS = int(SPACING_M / SPEED_MPS * 1e9), 86_400 * 10**9
-# Ground: patches of 50 m with one resistance each, on gentle hills.
+# Ground: 50 m patches of one resistance each, on gentle hills.
 RESISTANCES = np.array([0.015, 0.03, 0.05, 0.08])
 PATCH_M, HILL_M, GRADE = 50.0, 120.0, 0.08
 RESISTANCE_STD, GRADE_STD = 0.004, 0.01
 Batches = Sequence[tuple[str, Table]]
-HEADINGS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # of the roads: columns and rows of crossings per leg
+HEADINGS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # of roads: columns and rows of crossings per leg
 
 
 @dataclass(frozen=True)
 class RoadLeg:
-    """A drive from one crossing to the next. first_ns: stamp of its first sample; heading: index of HEADINGS."""
+    """A drive between crossings. first_ns: stamp of its first sample; heading: index of HEADINGS."""
 
     first_ns: int
     column: int
@@ -60,12 +59,12 @@ class RoadLeg:
 
 
 def samples_of(hours: float) -> int:
-    """How many samples `batches` gives in the first so many hours of work: whole legs, at least one."""
+    """Samples from `batches` in the first hours of work: whole legs, at least one."""
     return MACHINES * LEG_SAMPLES * max(1, round(hours * 3600 * 1e9 / (LEG_SAMPLES * SAMPLE_NS)))
 
 
 def batches(seed: int = 0) -> Iterator[tuple[str, Table]]:
-    """Names of machines and batches of samples, in the order in which they would come in, day after day."""
+    """Machine names and sample batches in order of arrival, endlessly."""
     draws = np.random.default_rng(seed).spawn(MACHINES)
     drives = [drive(draw) for draw in draws]
     while True:
@@ -76,7 +75,7 @@ def batches(seed: int = 0) -> Iterator[tuple[str, Table]]:
 
 
 def seconds_of(work: Iterator[tuple[str, Table]]) -> Iterator[Batches]:
-    """What each machine sends in each second, as it drives on; work: as of `batches`, where all begin a leg."""
+    """Machines' samples by second; work: of `batches`, all starting a leg."""
     while leg := list(islice(work, MACHINES * LEG_SAMPLES // BATCH)):
         machines = {name: np.concatenate([rows for other, rows in leg if other == name]) for name, _ in leg}
         for first in range(0, LEG_SAMPLES, A_SECOND):
@@ -84,12 +83,12 @@ def seconds_of(work: Iterator[tuple[str, Table]]) -> Iterator[Batches]:
 
 
 def drive(draw: np.random.Generator) -> Iterator[Table]:
-    """Samples of one machine, leg by leg, day after day."""
+    """Samples of one machine by leg, endlessly."""
     return (_drive(leg, draw) for leg in _legs(draw))
 
 
 def _legs(draw: np.random.Generator) -> Iterator[RoadLeg]:
-    """Legs of one machine, end to end; the night is between two days."""
+    """Legs of one machine, end to end, with nights between days."""
     column, row, heading = int(draw.integers(ROADS)), int(draw.integers(ROADS)), int(draw.integers(4))
     a_day = samples_of(HOURS) // (MACHINES * LEG_SAMPLES)
     for number in count():
@@ -106,7 +105,6 @@ def _on_site(column: int, row: int, heading: int) -> bool:
 
 
 def _drive(leg: RoadLeg, draw: np.random.Generator) -> Table:
-    """Samples of one leg."""
     n, (east, north) = LEG_SAMPLES, HEADINGS[leg.heading]
     along = np.arange(n) * SPACING_M
     right = draw.uniform(0.0, WIDTH_M / 2)
@@ -132,16 +130,16 @@ def _resistance(x: AnyArray, y: AnyArray) -> Floats:
 
 
 def evidence_hash(snapshot: Path) -> str:
-    """Hex digits of a snapshot's evidence: its header names the store, which is another one each time."""
+    """Digest of a snapshot's evidence; its header names the store, which varies."""
     with Checkpoint(snapshot) as checkpoint:
         parts = [checkpoint.index.tobytes(), *checkpoint.records(checkpoint.numbers_in(None))]
         return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def write_store(folder: Path, site: SiteConfig, rows: int, tail_rows: int, in_row: int = BATCH) -> None:
-    """Write a journal of so many rows, and a snapshot tail_rows before its end, none where it is shorter.
+    """Write a journal of `rows`, and a snapshot tail_rows before its end, if it is longer.
 
-    in_row: samples in a row: BATCH, or A_SECOND as machines send them that are always connected.
+    in_row: samples per row: BATCH, or A_SECOND for machines that are always connected.
     """
     config = ServerConfig().fold
     journal, grid = JournalLocation(folder).open(site.name, site.frame), Grid(site.cell_m, config)

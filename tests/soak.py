@@ -1,10 +1,10 @@
-"""Soak: hours of a site at work, compressed in time, against a real map server; its memory has to stay flat.
+"""Soak: hours of a working site, compressed in time, on a real map server; its memory must stay flat.
 
-python -m tests.soak: twelve hours in twelve minutes. With --whole there are 50 machines whose accelerometers have a
-zero that the server finds and takes off, corrections of a base station, a follower, and a page that is open.
+python -m tests.soak: twelve hours in twelve minutes. --whole adds 50 machines with accelerometer biases for the server
+to find, base station corrections, a follower, and an open page.
 
-Machines drive laps and send batches of 4 s, stamped as in that hour; visitors ask for the map all along. In the first
-third all is used for the first time, and calibration gathers the four hours of driving that it remembers of a machine.
+Machines drive laps and send 4 s batches stamped in site time; visitors query the map all along. The first third warms
+everything up, and calibration fills its four hours of memory.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ from tests.patience import PATIENCE_S
 
 START_NS = 1_767_225_600_000_000_000
 SITE_TOML = 'name = "soak"\norigin_lat_deg = 49.01\norigin_lon_deg = 8.4\n'
-BATCH_S, RATE_HZ = 4.0, 2.5  # of a machine: one batch so often, so many samples a second (5 m/s, one each 2 m)
-ASK_S, PAST_S, LOOK_S = 10.0, 100.0, 60.0  # site time between two questions, two about the past, two looks
+BATCH_S, RATE_HZ = 4.0, 2.5  # per machine: batch interval, sample rate (5 m/s, every 2 m)
+ASK_S, PAST_S, LOOK_S = 10.0, 100.0, 60.0  # site time between queries, queries of the past, looks
 MOST_GROWTH_PCT = 5.0
 WHOLE = 50  # machines
-ZERO = 0.004  # of an accelerometer, over g: this much is found within hours
+ZERO = 0.004  # accelerometer bias over g, found within hours
 
 
 @dataclass(frozen=True)
 class Look:
-    """The site after so many minutes, and resident memory of its processes [MiB]."""
+    """The site after some minutes, and resident memory of its processes [MiB]."""
 
     minute: float
     samples: int
@@ -62,17 +62,16 @@ class Look:
 
 @dataclass(frozen=True)
 class Soak:
-    """How a soak went. late_s: by how much the machines fell behind the pace, of site time."""
+    """Result of a soak. late_s: largest lag behind the pace, site time."""
 
     looks: tuple[Look, ...]
     sent: int
     late_s: float
 
     def growth_pct(self, process: str = "server") -> float:
-        """Growth of a process from the middle third of the run to its last: medians: one look is up to a tenth off.
+        """Memory growth from the run's middle third to its last, by medians: single looks vary by a tenth.
 
-        In the first third everything is used for the first time. Between two looks memory goes up and down with what is
-        being answered and folded.
+        The first third warms up; memory fluctuates with queries and folds.
         """
         memory = [look.mib[process] for look in self.looks]
         third = max(1, len(memory) // 3)
@@ -80,10 +79,10 @@ class Soak:
 
 
 class SoakMachine:
-    """One machine on laps of its own around the site; positions err slowly, as those of GPS do."""
+    """One machine on its own laps, with slow GPS-like errors."""
 
     def __init__(self, name: str, seed: int, zero: float = 0.0) -> None:
-        """zero: of its accelerometer, which c_rr and slope ahead have as well."""
+        """zero: accelerometer bias, also in c_rr and forward slope."""
         self.name, self._zero = name, zero
         self._draw = np.random.default_rng(seed)
         self._centre_m, self._radius_m = self._draw.uniform(80, 220, 2), self._draw.uniform(20, 70)
@@ -117,7 +116,7 @@ class SoakMachine:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run a soak and print its table; 1 where the memory grows."""
+    """Run a soak and print its table; 1 if memory grows."""
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
     parser.add_argument("--minutes", type=float, default=720.0, help="site time (default %(default)s)")
     parser.add_argument("--speed", type=float, default=60.0, help="times real time (default %(default)s)")
@@ -147,9 +146,9 @@ def report(result: Soak, growth_pct: Mapping[str, float]) -> None:
 
 
 def soak(folder: Path, minutes: float, speed: float, machines: int, *, whole: bool = False) -> Soak:
-    """Run router, map server and what else belongs to the whole, let machines drive and visitors ask.
+    """Run router, map server and optional parts with driving machines and visitors.
 
-    Returns what was seen each minute.
+    Returns the looks by minute.
     """
     (folder / "site.toml").write_text(SITE_TOML)
     site, endpoint = load_site(folder / "site.toml"), free_endpoint()
@@ -186,7 +185,7 @@ def _drive(
     run: tuple[float, float],
     machines: Sequence[SoakMachine],
 ) -> Soak:
-    """Send what all machines drive, one batch after the other, and look at the processes every minute of the site."""
+    """Send all machines' batches, and look at the processes every site minute."""
     end_s, speed = run
     session = open_session(SessionConfig(endpoint))
     looks: list[Look] = []
@@ -209,7 +208,7 @@ def _drive(
 
 
 def _send(session: zenoh.Session, key: str, payload: bytes) -> None:
-    """Send until it is acknowledged."""
+    """Send until acknowledged."""
     while True:
         for reply in session.get(key, payload=payload, timeout=60.0):
             if reply.ok is not None and isinstance(decode_reply(reply.ok.payload.to_bytes()), Ack):
@@ -217,7 +216,7 @@ def _send(session: zenoh.Session, key: str, payload: bytes) -> None:
 
 
 def _ask(endpoint: str, speed: float, over: threading.Event) -> None:
-    """Ask as a live map does, and from time to time for the past."""
+    """Query like a live map, occasionally for the past."""
     with connect(endpoint, "soak") as client:
         next_past_s = PAST_S
         begin_s = time.monotonic()
@@ -234,7 +233,7 @@ def _ask(endpoint: str, speed: float, over: threading.Event) -> None:
 
 @contextmanager
 def _survived() -> Iterator[None]:
-    """A visitor who is refused, or not answered, says so and asks again."""
+    """A refused or unanswered visitor reports it and retries."""
     try:
         yield
     except SitegridError as error:
@@ -242,7 +241,7 @@ def _survived() -> Iterator[None]:
 
 
 def _look_on(page: str, over: threading.Event) -> None:
-    """Keep a live page open that takes in all that it is sent."""
+    """Keep a live page open that reads everything."""
     while not over.is_set():
         with suppress(OSError, ConnectionClosed), open_socket(page, max_size=None) as socket:
             while not over.is_set():

@@ -1,6 +1,6 @@
-"""The house in figures: `python -m tests.structure [FOLDER] [--json]` prints those of any checkout.
+"""Figures of the house: `python -m tests.structure [FOLDER] [--json]` prints those of any checkout.
 
-Figures come from the files that git tracks, and nothing of the checkout is imported: an older one can be measured.
+From files tracked by git, without importing them: older checkouts can be measured.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from tests.paths import ROOT
 
 CONFIGS = ("agent", "server", "sim")
 AREAS = PRODUCT, LABORATORY, LABORATORY_TESTS, TESTS = ("product", "laboratory", "laboratory's tests", "tests")
-# Folders and pages that the laboratory has, or had before it was one folder.
+# Present and former folders of the laboratory.
 OF_LABORATORY = {"lab", "evaluation", "benchmarks", "benchmark", "results"}
 ADDS_FLAG = {"add_argument", "add"}
-COMMENT = re.compile(r"^(?: *|.* {2})# (.*)$", re.MULTILINE)  # as the formatter leaves them
+COMMENT = re.compile(r"^(?: *|.* {2})# (.*)$", re.MULTILINE)  # as left by the formatter
 
 
 @dataclass(frozen=True)
 class Module:
-    """A file of code: its path in the checkout, its lines, and the lines of each of its functions.
+    """A code file: path in the checkout, lines, and lines per function.
 
-    words: of docstrings and comments. constants: numeric ones of the module, and defaults of fields. flags: options of
-    the command line that it declares. imports: modules of the checkout, as the first level of the module imports them.
+    words: in docstrings and comments. constants: numeric module constants and field defaults. flags: declared command
+    line options. imports: the checkout's modules, from the top level.
     """
 
     path: Path
@@ -49,23 +49,23 @@ class Module:
 
     @property
     def name(self) -> str:
-        """As Python calls it."""
+        """As in Python."""
         return ".".join(self.path.with_suffix("").parts).removesuffix(".__init__")
 
     @property
     def area(self) -> str:
-        """Which part of the house it belongs to."""
+        """Part of the house."""
         is_laboratory, is_test = is_of_laboratory(self.path), "tests" in self.path.parts
         return AREAS[2 * is_test + (is_laboratory != is_test)]
 
 
 def is_of_laboratory(path: Path) -> bool:
-    """Whether a module or a page is the laboratory's."""
+    """Whether a module or page is the laboratory's."""
     return bool(OF_LABORATORY & set(path.with_suffix("").parts))
 
 
 def packages(root: Path) -> tuple[str, ...]:
-    """The packages of a checkout but `tests`, in the order of their layers where that is known."""
+    """A checkout's packages except `tests`, in layer order if known."""
     there = {path.parts[0] for path in _listed(root, "*/__init__.py") if len(path.parts) == 2} - {"tests"}
     linted = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
     return tuple(name for name in linted["root_packages"] if name in there)
@@ -73,29 +73,29 @@ def packages(root: Path) -> tuple[str, ...]:
 
 @cache
 def modules(root: Path, *folders: str) -> list[Module]:
-    """All modules of folders, `__init__` too."""
+    """All modules of folders, with `__init__`."""
     return [_module(root, path) for path in _listed(root, *folders) if path.suffix == ".py"]
 
 
 def crowds(everything: list[Module]) -> Counter[Path]:
-    """How many modules beside `__init__` each folder has."""
+    """Modules per folder, without `__init__`."""
     return Counter(module.path.parent for module in everything if module.path.name != "__init__.py")
 
 
 def options(root: Path, name: str) -> set[str]:
-    """Names of the options in an example of a configuration file, also of those that are commented out."""
+    """Options in an example configuration file, commented-out ones too."""
     text = (root / "config" / f"{name}.toml").read_text(encoding="utf-8")
-    commented = re.findall(r"^# (\w+) = ", text, re.MULTILINE) if name == "sim" else []  # as the scenario says
+    commented = re.findall(r"^# (\w+) = ", text, re.MULTILINE) if name == "sim" else []  # defaults from the scenario
     return {*commented, *_names(tomllib.loads(text), "")}
 
 
 def is_description(option: str) -> bool:
-    """Whether an option of the agent describes its machine or a sensor, rather than what the agent does."""
+    """Whether an agent's option describes machine or sensor rather than behaviour."""
     return option.startswith(("machine.", "sensor."))
 
 
 def figures(root: Path) -> dict[str, Any]:
-    """All figures of a checkout: by area, by package, and of the whole."""
+    """All figures: by area, by package, in total."""
     everything = modules(root, *packages(root), "tests")
     by_area = {area: [module for module in everything if module.area == area] for area in AREAS}
     code = by_area[PRODUCT] + by_area[LABORATORY]
@@ -114,7 +114,7 @@ def figures(root: Path) -> dict[str, Any]:
 
 
 def table(measured: Mapping[str, Any]) -> str:
-    """Figures for people: a column per area, then a line per package."""
+    """Figures for people: a column per area, a line per package."""
     areas = measured["areas"]
     shown = {area: {name: _shown(value) for name, value in values.items()} for area, values in areas.items()}
     for area, words in measured["document_words"].items():
@@ -195,7 +195,7 @@ def _prose(nodes: Sequence[ast.AST], text: str) -> Iterator[str]:
 
 
 def _constants(statement: ast.stmt) -> int:
-    """How many names in capitals it gives numbers, or what is calculated from numbers."""
+    """Number of capitalised names that it binds to numbers or sums of numbers."""
     if isinstance(statement, ast.AnnAssign):
         targets: list[ast.expr] = [statement.target]
     elif isinstance(statement, ast.Assign):
@@ -207,13 +207,13 @@ def _constants(statement: ast.stmt) -> int:
 
 
 def _defaults(kind: ast.ClassDef) -> int:
-    """How many of its fields have a numeric default, but for 0 and 1, with which sums and products begin."""
+    """Numeric field defaults except 0 and 1, neutral elements."""
     values = [each.value for each in kind.body if isinstance(each, ast.AnnAssign) and _is_numeric(each.value)]
     return sum(not (isinstance(value, ast.Constant) and value.value in (0, 1)) for value in values)
 
 
 def _is_numeric(value: ast.expr | None) -> bool:
-    """Whether a number stands in it, and neither a text nor a call."""
+    """Whether it contains a number, and neither text nor call."""
     nodes = list(ast.walk(value)) if value else []
     constants = [node.value for node in nodes if isinstance(node, ast.Constant)]
     numbers = [constant for constant in constants if type(constant) in (int, float, complex)]
@@ -221,7 +221,7 @@ def _is_numeric(value: ast.expr | None) -> bool:
 
 
 def _flags(nodes: Sequence[ast.AST]) -> Iterator[str]:
-    """Options of the command line that are declared there."""
+    """Declared command line options."""
     for call in (node for node in nodes if isinstance(node, ast.Call)):
         function = call.func
         name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
@@ -230,7 +230,7 @@ def _flags(nodes: Sequence[ast.AST]) -> Iterator[str]:
 
 
 def _imports(root: Path, tree: ast.Module) -> Iterator[str]:
-    """What it imports outside of functions, for types too: full names of modules of the checkout."""
+    """Modules of the checkout imported outside functions, for types too."""
     blocks = [tree.body, *(node.body for node in tree.body if isinstance(node, ast.If))]
     for node in (statement for block in blocks for statement in block):
         if isinstance(node, ast.Import):
@@ -253,7 +253,7 @@ def _document_words(root: Path) -> dict[str, int]:
 
 
 def _listed(root: Path, *patterns: str) -> list[Path]:
-    """Files that git tracks and that are there."""
+    """Existing files tracked by git."""
     listed = subprocess.run(["git", "ls-files", *patterns], cwd=root, capture_output=True, check=True, text=True)
     return [Path(name) for name in listed.stdout.splitlines() if (root / name).exists()]
 

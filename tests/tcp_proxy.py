@@ -1,7 +1,7 @@
-"""A TCP proxy on loopback with weather: cuts, black holes, slow spells, replies that are held back; it counts bytes.
+"""A TCP proxy on loopback with weather: cuts, black holes, slowness, delayed replies; it counts bytes.
 
-TCP itself neither repeats nor reorders bytes, so a reply that comes late is what can happen to delivery: it is held
-back for longer than the sender waits, who then sends the same batch again.
+TCP neither repeats nor reorders, so late replies are the remaining hazard: a delay beyond the sender's timeout makes it
+resend.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ CHUNK = 16384
 
 @dataclass(frozen=True)
 class Weather:
-    """What happens to links. cut: none stands, none comes up; hold_there, hold_back: no bytes to, or from, the router.
+    """State of links. cut: no connections; hold_there, hold_back: no bytes to or from the router.
 
-    bytes_per_s: so many a second and direction, 0 for any number.
+    bytes_per_s: in each direction, 0: unlimited.
     """
 
     cut: bool = False
@@ -35,16 +35,16 @@ FAIR = Weather()
 
 
 class Proxy:
-    """Forwards connections to a port on loopback. Leaving the block ends its threads and links.
+    """Forwards connections to a loopback port, for the length of the block.
 
-    buffer_bytes: what the kernel may hold back for it, so that a slow link is felt at the sender; 0 for its own choice.
+    buffer_bytes: kernel buffers, small so that senders feel a slow link; 0: default.
     """
 
     def __init__(self, port: int, weather: Weather = FAIR, buffer_bytes: int = 0) -> None:
         self.weather = weather
         self._port = port
         self._listener = socket.create_server(("127.0.0.1", 0))
-        if buffer_bytes:  # taken over by the connections that it accepts
+        if buffer_bytes:  # inherited by accepted connections
             self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer_bytes)
         self._links: list[socket.socket] = []
         self._threads: list[threading.Thread] = []
@@ -55,15 +55,13 @@ class Proxy:
 
     @property
     def endpoint(self) -> str:
-        """Where to connect to."""
         return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
 
     def carried(self, direction: Direction) -> int:
-        """Bytes that it has handed on so far."""
+        """Bytes forwarded so far."""
         return self._bytes[direction]
 
     def set(self, weather: Weather) -> None:
-        """Have other weather from now on."""
         self.weather = weather
         if weather.cut:
             self._drop_links()
@@ -113,7 +111,7 @@ class Proxy:
             self._start(self._pump, far, near, "back")
 
     def _pump(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
-        """Move bytes until either end is gone; what was read before a cut is lost with it."""
+        """Forward bytes until either end is gone; bytes read before a cut are lost."""
         try:
             while data := source.recv(CHUNK):
                 while getattr(self.weather, f"hold_{direction}") and not self._closed.is_set():

@@ -1,4 +1,4 @@
-"""Which cases of a test wait for the night: those that seldom fail alone."""
+"""Cases that wait for the night, because they seldom fail alone."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 
 def by_night(cases: Iterable[Any], day: Iterable[Any] = ()) -> list[Any]:
-    """Cases for parametrize, of which `make test` runs those of `day` alone."""
+    """Cases for parametrize; `make test` runs only those of `day`."""
     by_day = list(day)
     return [case if case in by_day else _at_night(case) for case in cases]
 

@@ -1,1 +1,1 @@
-"""The fault suite: real processes, real faults, and a count of what was lost or came twice (docs/guarantees.md)."""
+"""Fault suite: real processes, real faults, counts of lost and double samples (docs/guarantees.md)."""

@@ -1,7 +1,7 @@
-"""`python -m tests.chaos`: real processes under faults, and a table of what was lost or came twice.
+"""`python -m tests.chaos`: real processes under faults, and a table of lost and double samples.
 
-Exit code 0 if nothing was, 1 if something was or anything else went wrong, 2 for a wrong option, 130 if interrupted.
-The order and the times of faults come from --seed, which is printed.
+Exit code 0: none; 1: some, or any other failure; 2: wrong option; 130: interrupted. Order and times of faults follow
+from --seed, which is printed.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from tests.chaos.recordings import make
 from tests.chaos.scenario import FaultRun
 
 MACHINES = 3
-WHOLE_S = 480.0  # of the whole suite; scales what is counted and not timed
-LANES = 3  # scenarios that run at the same time: most of them mostly wait
+WHOLE_S = 480.0  # of the whole suite; scales untimed counts
+LANES = 3  # concurrent scenarios, which mostly wait
 
 
 @dataclass(frozen=True)
 class ChaosFault:
-    """A scenario. share: of the suite's time that its faults strike."""
+    """A scenario. share: of the suite's time."""
 
     name: str
     run: Callable[[FaultRun], FaultOutcome]
     share: float = 0.0
 
 
-# The longest first, so that lanes end together.
+# Longest first, so that lanes end together.
 FAULTS = (
     ChaosFault("kills", site_faults.kills, 0.45),
     ChaosFault("power", disk_faults.power),
@@ -118,8 +118,8 @@ def _names(text: str) -> list[str]:
 def run_suite(
     faults: Iterable[ChaosFault], folder: Path, console: Console, seed: int, seconds: float
 ) -> list[FaultOutcome]:
-    """Run faults, a few at a time; InterruptError if the suite was stopped."""
-    logging.disable()  # what the parts under test log of their misfortunes
+    """Run faults, a few at a time; InterruptError if stopped."""
+    logging.disable()  # the tested parts log their misfortunes
     recordings = make(folder / "recordings", MACHINES, seed, stop=console.stop)
     scale = seconds / WHOLE_S
     scenarios = [
@@ -128,7 +128,7 @@ def run_suite(
     ]
     with ThreadPoolExecutor(LANES) as lanes:
         runs = [lanes.submit(_run, fault, scenario) for fault, scenario in scenarios]
-        while wait(runs, timeout=0.5).not_done:  # with a time-out, or a signal that another thread got is not heard
+        while wait(runs, timeout=0.5).not_done:  # without a timeout, signals caught by other threads are not noticed
             pass
         outcomes = [run.result() for run in runs]
     if console.stop.is_set():
@@ -137,7 +137,7 @@ def run_suite(
 
 
 def _run(fault: ChaosFault, scenario: FaultRun) -> FaultOutcome:
-    """Run one; what goes wrong in it is a result, and the others go on."""
+    """Run one; its errors are results, and the others continue."""
     if scenario.console.stop.is_set():
         return FaultOutcome(fault.name)
     try:
@@ -151,7 +151,7 @@ def _run(fault: ChaosFault, scenario: FaultRun) -> FaultOutcome:
 
 
 def totals(outcomes: Sequence[FaultOutcome], seed: int) -> dict[str, Any]:
-    """Sums for machines. kills: of the fault of that name."""
+    """Sums over all faults. kills: of the fault `kills`."""
     table: dict[str, Any] = {"kills": sum(outcome.count for outcome in outcomes if outcome.fault == "kills")}
     for name in ("recorded", "merged", "declared", "lost", "named", "double", "silent"):
         table[name] = sum(getattr(outcome, name) for outcome in outcomes)

@@ -1,4 +1,4 @@
-"""Bits that flip in database files at rest: found and named, or without effect, never served as data."""
+"""Flipped bits in database files at rest: detected and named, or harmless, never served as data."""
 
 from __future__ import annotations
 
@@ -27,28 +27,26 @@ from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
 from tests.journals import history_beside
 
-STUCK_S = 2.0  # reading a spool of the suite takes milliseconds
+STUCK_S = 2.0  # reading the suite's spools takes milliseconds
 
 
 class FlipVerdict(StrEnum):
-    """What became of a bit."""
-
     DETECTED = "detected"
-    HARMLESS = "harmless"  # or found and made good, as a snapshot that is passed over
+    HARMLESS = "harmless"  # or repaired, like a skipped snapshot
     SERVED = "served"
-    UNNAMED = "unnamed"  # an error, but none that names the file
+    UNNAMED = "unnamed"  # an error that does not name the file
 
 
-FLIPS = 400  # of each file, in the whole suite
+FLIPS = 400  # per file, in the whole suite
 Content = dict[Any, Any]
 
 
 def flips(scenario: FaultRun) -> FaultOutcome:
-    """Stop a site, flip bits in copies of its files; then damage the files themselves, and restore them."""
+    """Stop a site, flip bits in copies of its files; then damage and restore the files themselves."""
     with scenario.site() as site:
         site.start_all()
         site.linger(scenario.seconds)
-        for role in (SERVER, *site.machines, ROUTER):  # the server first: spools are to have samples
+        for role in (SERVER, *site.machines, ROUTER):  # the server first, so that spools fill
             site.stop(role)
             site.console.wait(1.0)
         n, verdicts = max(20, round(FLIPS * scenario.scale)), Counter[str]()
@@ -66,12 +64,12 @@ def flips(scenario: FaultRun) -> FaultOutcome:
         site.start_all()
         outcome = site.finish(scenario.fault, verdicts.total())
         outcome.notes |= verdicts
-        outcome.longest_pause_s = None  # it was switched off meanwhile
+        outcome.longest_pause_s = None  # it was off meanwhile
         return outcome
 
 
 def _files(site: ChaosSite) -> list[tuple[Path, Callable[[Path], Content]]]:
-    """Files, and how to read what they say."""
+    """Files, and their readers."""
     store = site.folder / "store"
     definition = load_site(site.folder / "site.toml")
     snapshot = max(store.glob("snapshot-*"), key=lambda path: path.stat().st_mtime)
@@ -84,7 +82,7 @@ def _files(site: ChaosSite) -> list[tuple[Path, Callable[[Path], Content]]]:
 
 
 def read_store(folder: Path, definition: Any) -> Content:
-    """All that a server would take from its folder: rows, watermarks, grid."""
+    """What a server would load: rows, watermarks, grid."""
     store = Store(JournalLocation(folder), definition, ServerConfig(), lambda: 10**18)
     try:
         rows = {
@@ -99,7 +97,7 @@ def read_store(folder: Path, definition: Any) -> Content:
         ]
         return {
             "rows": rows,
-            "placed": placed,  # what is found by time and place
+            "placed": placed,  # found by time and place
             "events": store.journal.events(),
             "marks": marks,
             "grid": (grid.folded, sorted(votes)),
@@ -110,7 +108,7 @@ def read_store(folder: Path, definition: Any) -> Content:
 
 
 def read_spool(path: Path) -> Content:
-    """All that an agent would send: contents by identity, and what it declares lost."""
+    """What an agent would send: contents by identity, declared losses."""
     spool, contents, end_s = Spool(path, SpoolConfig()), {}, time.monotonic() + STUCK_S
     declared = 0  # lost, to the server, which counts them
     spool._db.set_progress_handler(lambda: time.monotonic() > end_s, 20)
@@ -122,7 +120,7 @@ def read_spool(path: Path) -> Content:
             spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
         counters = spool.counters()
         return {"contents": contents, "named": counters["put_aside"] + declared}
-    except StoreError:  # the uplink reports it, and sends nothing
+    except StoreError:  # the uplink reports it and sends nothing
         if time.monotonic() > end_s:
             raise TimeoutError from None
         raise
@@ -132,7 +130,7 @@ def read_spool(path: Path) -> Content:
 
 
 def _flip_all(path: Path, look: Callable[[Path], Content], rng: random.Random, n: int, folder: Path) -> Counter[str]:
-    """Flip one bit in each of n copies of a file's folder, and compare what is read with what was there."""
+    """Flip one bit in each of n copies of a file's folder; compare with the original."""
     truth, verdicts = look(_copy(path, folder)), Counter[str]()
     identities = _near_identities(path.read_bytes(), truth)
     for i in range(n):
@@ -147,7 +145,7 @@ def _flip_all(path: Path, look: Callable[[Path], Content], rng: random.Random, n
 
 
 def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[FlipVerdict, str]:
-    """Return what became of a damaged file, and the kind of an error that is not what a person should see."""
+    """Verdict on a damaged file, and the kind of an error that people should not see."""
     try:
         content = look(path)
     except StoreError as error:
@@ -157,12 +155,12 @@ def judge(path: Path, look: Callable[[Path], Content], truth: Content) -> tuple[
     if content == truth:
         return FlipVerdict.HARMLESS, ""
     if content.get("named", 0) > truth.get("named", 0) and content["contents"].items() <= truth["contents"].items():
-        return FlipVerdict.DETECTED, ""  # the damaged samples are named or declared lost, the others sent
+        return FlipVerdict.DETECTED, ""  # damaged samples are named or declared lost, the others sent
     return FlipVerdict.SERVED, ""
 
 
 def _near_identities(content: bytes, truth: Content) -> list[int]:
-    """Where a file keeps identities, watermarks, counts and times: few bytes, which chance would rarely hit."""
+    """Bytes of identities, watermarks, counts and times, which chance would rarely hit."""
     ids = {spool_id for _, spool_id in truth.get("marks", ())} | {spool_id for spool_id, _ in truth.get("contents", ())}
     texts = {spool_id.to_bytes(8, "big") for spool_id in ids} | {f"{spool_id:016x}".encode() for spool_id in ids}
     texts |= {stamp_ns.to_bytes(8, "big") for _, stamp_ns in truth.get("placed", ())}
@@ -171,7 +169,7 @@ def _near_identities(content: bytes, truth: Content) -> list[int]:
 
 
 def flip(path: Path, rng: random.Random, among: list[int] | None = None) -> None:
-    """Flip one bit; among: in one of these bytes."""
+    """Flip one bit; among: within these bytes."""
     content = bytearray(path.read_bytes())
     content[rng.choice(among or range(len(content)))] ^= 1 << rng.randrange(8)
     path.write_bytes(content)
@@ -184,7 +182,7 @@ def _copy(path: Path, folder: Path) -> Path:
 
 
 def _damage_and_restore(site: ChaosSite) -> None:
-    """With files that are damaged for sure, server and agent must not start, and say which file it is."""
+    """Server and agent must refuse surely damaged files by name."""
     machine = site.machines[0]
     site.start(ROUTER)
     for role, path in (

@@ -1,4 +1,4 @@
-"""A construction site of real processes that can be killed, frozen and cut off, and is counted at the end."""
+"""A site of real processes that can be killed, frozen and cut off, with a final count."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from tests.chaos.recordings import IDLE, SECONDS, SPEED, START_NS, Recordings
 from tests.journals import history_beside
 from tests.memory import memory_mb
 
-READY_S = 120.0  # a server's first start in a new folder compiles its kernels
+READY_S = 120.0  # first start in a new folder compiles kernels
 RESUME_S = 60.0
-ROUTER, SERVER, SECOND, WEB = "router", "server", "second", "web"  # the second: a map server with a store of its own
+ROUTER, SERVER, SECOND, WEB = "router", "server", "second", "web"  # second: a map server with its own store
 COMMAND = ("-m", "sitegrid.cli")
 HOUR_S = 3600
-# The cheaper filter, and a short lag: the suite needs many samples that are true to their form and come soon, not good
-# ones. `window` and `parked` have the usual lag.
+# Cheaper filter, short lag: the suite needs many valid, timely samples, not accurate ones. `window` and `parked` use
+# the usual lag.
 AGENT = """
 linger_s = 20.0
 [pipeline.localisation]
@@ -44,19 +44,19 @@ filter = "ekf"
 lag_s = {lag_s}
 """
 LAG_S = 8.0
-# Snapshots every few seconds, so that they are written under faults too; the audit would exclude machines.
+# Frequent snapshots are written under faults too; the audit would exclude machines.
 SERVER_TOML = "[store]\nsnapshot_s = 2.0\n[trust]\nexclude = false\n"
 ALL_STOPPED = (signal.SIGCONT, signal.SIGTERM)
 
 
 class StartError(Exception):
-    """The site did not come to life, before any fault."""
+    """The site did not start, before any fault."""
 
 
 class ChaosSite:
-    """Router, map server and agents. Leaving the block ends them all.
+    """Router, map server and agents, for the length of the block.
 
-    clock: the site's clock. first_ns: when the first drives begin.
+    clock: the site's. first_ns: start of the first drives.
     """
 
     def __init__(
@@ -72,14 +72,14 @@ class ChaosSite:
             (folder / name).mkdir(parents=True)
         self.folder, self.console = folder, console
         self.machines = recordings.machines
-        self.guests: tuple[str, ...] = ()  # names of machines that are no processes, see guests.py
+        self.guests: tuple[str, ...] = ()  # names of machines without process, see guests.py
         self.endpoints = dict.fromkeys((ROUTER, SERVER, SECOND, WEB, *self.machines), free_endpoint())
         self.prefix: dict[str, tuple[str, ...]] = {}
         self.env: dict[str, dict[str, str]] = {}
         self.options: dict[str, tuple[str, ...]] = {}
         self.modules: dict[str, tuple[str, ...]] = {}
         self.speed, self.variant = SPEED, ""  # of the drives
-        self.excuses: tuple[str, ...] = ()  # last words with which a process may end, to be started again
+        self.excuses: tuple[str, ...] = ()  # last words that allow a process to end and be restarted
         self.outcome = FaultOutcome("")
         self.faults: list[TimeSpan] = []
         self._ack_ms: list[int] = []
@@ -100,13 +100,13 @@ class ChaosSite:
             process.end()
 
     def set_lag(self, lag_s: float) -> None:
-        """The smoother's lag of all agents that are started from now on."""
+        """Set the smoother's lag of agents started from now on."""
         (self.folder / "agent.toml").write_text(AGENT.format(lag_s=lag_s), encoding="utf-8")
 
     # --- what runs ---------------------------------------------------------------------------------------------------
 
     def start_all(self) -> None:
-        """Start everything, and wait until every machine has samples in the journal."""
+        """Start everything, and wait for samples of every machine."""
         before = len(self.outcome.problems)
         for role in (ROUTER, SERVER, *self.machines):
             self.start(role)
@@ -118,7 +118,7 @@ class ChaosSite:
             raise StartError("; ".join(wrong))
 
     def start(self, role: str, *, idle: bool = False) -> Process:
-        """Start a router, a server, or a machine's agent; idle: one that only delivers what is left."""
+        """Start a router, server or agent; idle: only delivers its spool."""
         self._starts += 1
         self._starts_of[role] += 1
         words = self._words(role, IDLE if idle else self.variant)
@@ -134,11 +134,11 @@ class ChaosSite:
         self._running[role].send(number)
 
     def peak_mb(self, role: str) -> float:
-        """The most memory that a process had since its start, or since that was forgotten."""
+        """Peak memory since the start, or since `forget_peak_mb`."""
         return memory_mb("VmHWM", self._running[role].pid)
 
     def forget_peak_mb(self, role: str) -> float:
-        """Have the peak counted from now on; returns what the process has now."""
+        """Reset the peak; returns the current memory."""
         Path(f"/proc/{self._running[role].pid}/clear_refs").write_text("5", encoding="ascii")
         return memory_mb("VmRSS", self._running[role].pid)
 
@@ -148,28 +148,28 @@ class ChaosSite:
             self.start(role)
 
     def put_down(self, role: str) -> None:
-        """End a process with SIGKILL, and leave it so."""
+        """Kill a process for good."""
         self._running.pop(role).end(signal.SIGKILL)
 
     def words_of_refusal(self, role: str) -> str | None:
-        """Wait until a process that was started works, None, or has refused to: its last words."""
+        """Wait until a started process works (None), or refuses: its last words."""
         process = self._running[role]
         self.wait(lambda: process.said("ready") or process.code is not None, READY_S, f"{role} is not ready")
         return process.last_words() if process.code is not None and not process.said("ready") else None
 
     def deliver_rest(self, machine: str) -> None:
-        """Have a machine that is not running deliver what its spool has, and nothing new."""
+        """Deliver a stopped machine's spool, without new samples."""
         process = self.start(machine, idle=True)
         self.wait(lambda: process.code is not None, RESUME_S, "left-over samples are not delivered")
         self._running.pop(machine).end()
 
     def log_of(self, role: str) -> str:
-        """What all processes of a role have logged."""
+        """Logs of all processes of a role."""
         paths = sorted((self.folder / "log").glob(f"*-{role}.err"))
         return "".join(path.read_text(encoding="utf-8", errors="replace") for path in paths)
 
     def stop(self, role: str) -> None:
-        """End a process with SIGTERM; it is to obey within a few seconds."""
+        """End a process with SIGTERM; it must obey within seconds."""
         process, began_s = self._running.pop(role), time.monotonic()
         code = process.end(*ALL_STOPPED)
         took_s = time.monotonic() - began_s
@@ -180,12 +180,12 @@ class ChaosSite:
         self._note_report(process)
 
     def expect_end(self, role: str) -> tuple[int | None, str]:
-        """Start what cannot run; returns its exit code, None if it does run, and its last words."""
+        """Start what cannot run; returns exit code (None: it runs) and last words."""
         self.start(role)
         return self.wait_end(role)
 
     def wait_end(self, role: str) -> tuple[int | None, str]:
-        """Wait for a process to end by itself; returns its exit code, None if it runs on, and its last words."""
+        """Wait for a process to end; returns exit code (None: it runs on) and last words."""
         process = self._running[role]
         self.wait(lambda: process.code is not None, READY_S, f"{role} runs on")
         return self._running.pop(role).code, process.last_words()
@@ -194,7 +194,7 @@ class ChaosSite:
         self.wait(lambda: self._running[role].said("ready"), READY_S, f"{role} is not ready")
 
     def wait_runs(self) -> None:
-        """Wait until there are samples of every start of every agent in the journal."""
+        """Wait for samples of every agent start in the journal."""
 
         def are_there() -> bool:
             self.tend()
@@ -204,7 +204,7 @@ class ChaosSite:
         self.wait(are_there, READY_S, "some runs have no samples")
 
     def wait_delivered(self) -> None:
-        """Wait until all that the agents have recorded so far is in the journal, while they run."""
+        """Wait for everything recorded so far, agents running."""
 
         def is_there() -> bool:
             progress = self.progress()
@@ -214,7 +214,7 @@ class ChaosSite:
         self.wait(is_there, RESUME_S, "recorded samples stay with their machines")
 
     def tend(self) -> None:
-        """Start again what has ended by itself; only the end of a drive, or one with an excuse, is no problem."""
+        """Restart ended processes; it is a problem unless a drive ended or an excuse applies."""
         for role, process in list(self._running.items()):
             if process.code is not None:
                 words = process.last_words()
@@ -225,7 +225,7 @@ class ChaosSite:
 
     @contextmanager
     def fault(self) -> Iterator[None]:
-        """Note how long a fault lasts."""
+        """Record how long a fault lasts."""
         began_s = time.time()
         try:
             yield
@@ -233,7 +233,6 @@ class ChaosSite:
             self.faults.append((began_s, time.time()))
 
     def linger(self, seconds: float) -> None:
-        """Let time pass, and tend."""
         end_s = time.monotonic() + seconds
         while (left_s := end_s - time.monotonic()) > 0:
             self.console.wait(min(left_s, 0.25))
@@ -245,7 +244,7 @@ class ChaosSite:
     # --- the end -----------------------------------------------------------------------------------------------------
 
     def finish(self, fault: str, count: int) -> FaultOutcome:
-        """Wait until every machine is served again, have everything delivered, end it, and count."""
+        """Wait until all machines are served, deliver everything, stop, count."""
         self.outcome.fault, self.outcome.count = fault, count
         ended_s = time.time()
         self._resume()
@@ -269,14 +268,14 @@ class ChaosSite:
         return self.outcome
 
     def progress(self) -> dict[str, int]:
-        """How many samples of each machine are in the journal."""
+        """Journalled samples by machine."""
         counts: Counter[str] = Counter()
         for (machine, _), mark in self._marks().items():
             counts[machine] += mark.seq
         return counts
 
     def _marks(self) -> Mapping[tuple[str, int], Watermark]:
-        """Progress of every run in the journal; nothing while it is being made, or recovered."""
+        """Progress of all runs; empty while the journal is created or recovered."""
         try:
             with SqliteReader(self.folder / "store" / JOURNAL_FILE) as reader:
                 return reader.watermarks()
@@ -284,7 +283,6 @@ class ChaosSite:
             return {}
 
     def _note_report(self, process: Process) -> None:
-        """Take what an agent reported when it ended."""
         if report := process.line("ended"):
             self._ack_ms.append(report["uplink"]["ack_ms_max"])
 
@@ -306,7 +304,7 @@ class ChaosSite:
             rows = [(r.machine, r.received_ns * 1e-9) for r in history_rows(history_beside(reader))]
             declared = sum(mark.lost for mark in reader.watermarks().values())
             shortfalls = [Shortfall.from_event(event) for event in reader.events(KIND)]
-            named = missing(shortfalls, reader.watermarks()).total()  # as `info`, metrics and the doctor have it
+            named = missing(shortfalls, reader.watermarks()).total()  # as in `info`, metrics and doctor
         out = self.outcome
         out.recorded, out.merged, out.double = result.recorded, result.merged, result.double
         out.declared = min(declared, result.lost)
@@ -317,7 +315,7 @@ class ChaosSite:
         out.notes |= {"declared in all": declared, "unrecorded": result.unrecorded, "rows": len(rows)}
         if result.unrecorded:
             self.problem(f"{result.unrecorded} samples in the journal that nobody recorded")
-        # Undo the server's clock having been an hour off: no scenario lasts that long.
+        # Undo hour steps of the server's clock: no scenario lasts that long.
         true = [(name, s - round((s - ended_s) / HOUR_S) * HOUR_S) for name, s in rows]
         commits = {machine: [s for name, s in true if name == machine] for machine in self.machines}
         out.longest_pause_s = max(
@@ -325,7 +323,7 @@ class ChaosSite:
         )
 
     def wait(self, is_so: Callable[[], bool], timeout_s: float, problem: str) -> None:
-        """Wait until something holds; a problem if it never does."""
+        """Wait for a condition; its absence is a problem."""
         end_s = time.monotonic() + timeout_s
         while not is_so():
             if time.monotonic() > end_s:

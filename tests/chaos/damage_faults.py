@@ -1,7 +1,7 @@
-"""Damage of files that a site works with: write-ahead logs, a store restored from a backup, calibrations.
+"""Damaged files of a site: write-ahead logs, a store from a backup, calibrations.
 
-Some of it destroys samples that were acknowledged. Then all of them must be named: by the log of the server or of the
-agent, and counted by machine; and all others must be there once.
+If acknowledged samples are destroyed, all must be named in the server's or agent's log and counted by machine; all
+others must exist once.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from tests.chaos.chaos_site import SERVER, ChaosSite
 from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
 
-FLIPS = 150  # of copies of each log that a kill leaves, in the whole suite
-PAUSE_S = 1.5  # in which samples gather
-BEFORE = Calibration(0.0031, -0.02, ((1e-6, -2e-7), (-2e-7, 1e-4)), 1, 41)  # older than what any drive gives
+FLIPS = 150  # copies of each log, in the whole suite
+PAUSE_S = 1.5  # samples accumulate
+BEFORE = Calibration(0.0031, -0.02, ((1e-6, -2e-7), (-2e-7, 1e-4)), 1, 41)  # older than any drive's
 
 
 def wal_flip(scenario: FaultRun) -> FaultOutcome:
-    """Kill the server or an agent, flip a bit of the write-ahead log that it leaves, and start it again."""
+    """Kill the server or an agent, flip a bit of its write-ahead log, restart it."""
     with scenario.site() as site:
         site.start_all()
         rng, left_s, strikes, verdicts = scenario.rng, max(2 * PAUSE_S, scenario.seconds), 0, Counter[str]()
@@ -62,7 +62,7 @@ def _database(site: ChaosSite, victim: str) -> Path:
 
 
 def flip(database: Path, rng: random.Random) -> None:
-    """Flip a bit of the part of a log that SQLite would take; none where there is no such part."""
+    """Flip a bit in the valid part of a log; none without such a part."""
     log = database.with_name(f"{database.name}-wal")
     content = bytearray(log.read_bytes()) if log.exists() else bytearray()
     if frames := scan(bytes(content)).recovered:
@@ -72,7 +72,7 @@ def flip(database: Path, rng: random.Random) -> None:
 
 
 def _flip_copies(site: ChaosSite, victim: str, rng: random.Random, n: int) -> Counter[str]:
-    """Open copies of what a kill left, each with another bit flipped: what is missing must be counted."""
+    """Open copies with one flipped bit each: missing samples must be counted."""
     database, verdicts, folder = _database(site, victim), Counter[str](), site.folder / "flipped"
     look = _look_at_journal if victim == SERVER else _look_at_spool
     truth = None
@@ -99,7 +99,7 @@ def _flip_copies(site: ChaosSite, victim: str, rng: random.Random, n: int) -> Co
 
 
 def _look_at_journal(path: Path, site: ChaosSite) -> tuple[int, int]:
-    """Samples that a journal has, and those that it says are missing."""
+    """Samples of a journal, and those it reports missing."""
     definition = load_site(site.folder / "site.toml")
     with closing(SqliteJournal(path, definition.name, definition.frame)) as journal:
         shortfalls = [Shortfall.from_event(event) for event in journal.events(KIND)]
@@ -108,14 +108,14 @@ def _look_at_journal(path: Path, site: ChaosSite) -> tuple[int, int]:
 
 
 def _look_at_spool(path: Path, _: ChaosSite) -> tuple[int, int]:
-    """Samples that wait in a spool, and those that it says are gone."""
+    """Samples in a spool, and those it reports gone."""
     with closing(Spool(path, SpoolConfig())) as spool:
         counters = spool.counters()
     return counters["depth"], counters["gone"]
 
 
 def _flip_and_start(site: ChaosSite, victim: str, database: Path, rng: random.Random) -> str:
-    """Flip a bit and start the process again; where it refuses to start, as it may, put the files back as they were."""
+    """Flip a bit and restart; if the process refuses, as it may, restore the files."""
     kept = site.folder / "kept"
     shutil.copytree(database.parent, kept)
     flip(database, rng)
@@ -132,9 +132,9 @@ def _flip_and_start(site: ChaosSite, victim: str, database: Path, rng: random.Ra
 
 
 def restored_store(scenario: FaultRun) -> FaultOutcome:
-    """Restore the store from a backup that is older than what was acknowledged.
+    """Restore the store from an outdated backup.
 
-    One machine still has what is missing, as its spool is from a backup, too; the others have deleted it.
+    One machine still has the missing samples in an outdated spool; the others deleted them.
     """
     with scenario.site() as site:
         site.start_all()
@@ -149,7 +149,7 @@ def restored_store(scenario: FaultRun) -> FaultOutcome:
         site.linger(max(PAUSE_S, scenario.seconds / 2))
         with site.fault():
             site.stop(SERVER)
-            site.console.wait(PAUSE_S)  # samples gather in the spools
+            site.console.wait(PAUSE_S)  # samples accumulate
             site.put_down(holder)
             spools = site.folder / "spool"
             held = {path: path.read_bytes() for path in spools.glob(f"{holder}.db*")}
@@ -182,7 +182,7 @@ def restored_store(scenario: FaultRun) -> FaultOutcome:
 
 
 def calibration_flip(scenario: FaultRun) -> FaultOutcome:
-    """Flip each bit of a calibration in copies; then start agents with a damaged one, which they have to name."""
+    """Flip each bit of a calibration in copies; agents must name a damaged one."""
     with scenario.site() as site:
         files = {machine: site.folder / "spool" / f"{machine}.calibration.json" for machine in site.machines}
         for machine, path in files.items():
@@ -196,7 +196,7 @@ def calibration_flip(scenario: FaultRun) -> FaultOutcome:
                 site.put_down(machine)
                 save(path, machine, BEFORE)
                 content = path.read_bytes()
-                path.write_bytes(content.replace(b'"zero": 0.0031', b'"zero": 0.0030'))  # a flip of the lowest bit
+                path.write_bytes(content.replace(b'"zero": 0.0031', b'"zero": 0.0030'))  # lowest bit
                 site.start(machine)
                 site.wait_ready(machine)
             if "calibration" not in site.log_of(machine):
@@ -208,7 +208,7 @@ def calibration_flip(scenario: FaultRun) -> FaultOutcome:
 
 
 def _flip_calibration(path: Path, machine: str) -> tuple[int, int]:
-    """Flip each bit: how many flips, and how many gave another calibration without an error."""
+    """Flip each bit; returns flips, and wrong calibrations without an error."""
     save(path, machine, BEFORE)
     whole, used = path.read_bytes(), 0
     for at in range(8 * len(whole)):
@@ -231,7 +231,7 @@ def _lost_by_machine(site: ChaosSite) -> dict[str, int]:
 
 
 def _require_named(site: ChaosSite) -> None:
-    """What machines declared lost must stand in the server's log, by machine."""
+    """Declared losses must be in the server's log, by machine."""
     log = site.log_of(SERVER)
     for machine, n in _lost_by_machine(site).items():
         if not any('"declared lost"' in line and f'"{machine}"' in line for line in log.splitlines()):

@@ -1,8 +1,8 @@
-"""The real spool and the real store on a disk that loses or tears what was not synced, or whose writes fail.
+"""Real spool and store on a disk that loses or tears unsynced data, or whose writes fail.
 
-`python -m tests.chaos.disk_faults WHAT CONTROL FOLDER SEED STRIDE`: the same work is done again and again, each time
-with another write, sync or new file that fails (and, by turns, one or two after it): full disk and I/O error at every
-write of the spool and of the store. The last line is the outcome as JSON.
+`python -m tests.chaos.disk_faults WHAT CONTROL FOLDER SEED STRIDE`: repeats the same work with another failing write,
+sync or new file each time (sometimes one or two more after it): full disk and I/O error at every write. The last line
+is the outcome as JSON.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
 from tests.journals import history_beside
 
-CUTS = 2000  # of the whole suite, half of them of the spool
+CUTS = 2000  # in the whole suite, half of the spool
 STEPS = {"spool": 400, "store": 200}
 SWEEP_STEPS = 12
-MOST = 5000  # writes of a sweep; the work ends long before
+MOST = 5000  # bound of a sweep, far beyond its work
 IN_MEMORY = Path("/dev/shm")
 SampleNumber = tuple[int, int]  # spool_id, seq
 
 
 @dataclass(frozen=True)
 class Remains:
-    """What is there after a cut. contents: of each identity, as often as it is found."""
+    """Data after a cut. contents: per identity, with repetitions."""
 
     contents: dict[SampleNumber, list[str]]
     problem: str = ""
 
 
 def power(scenario: FaultRun) -> FaultOutcome:
-    """Cut the power of a spool and of a store at random moments of their work, and open them again."""
+    """Cut the power of a working spool and store at random moments, and reopen them."""
     total = FaultOutcome(scenario.fault)
     scenario.folder.mkdir(parents=True)
     if not (library := build(scenario.folder)):
@@ -65,7 +65,6 @@ def power(scenario: FaultRun) -> FaultOutcome:
 
 
 def trace(library: Path, folder: Path, what: str, seed: int, *options: str) -> list[Operation]:
-    """Operations of a worker on an empty folder."""
     folder.mkdir(parents=True)
     disk, log = folder / "disk", folder / "trace"
     disk.mkdir()
@@ -82,7 +81,7 @@ def cut(
     rng: random.Random,
     wait: Callable[[float], None] = lambda _: None,
 ) -> FaultOutcome:
-    """Cut at random points; every cut is judged against what was promised before it."""
+    """Cut at random points and compare with the promises made before."""
     points = sorted(rng.choices(range(1, len(operations)), k=cuts))
     outcome, disk, promises, done = FaultOutcome("power", count=cuts), Disk(), "", 0
     for point in points:
@@ -104,7 +103,7 @@ def cut(
 
 
 def wear_marks(folder: Path, rng: random.Random) -> None:
-    """Leave marks as they are, or behind, or torn, or none: they are never synced, and must never raise an alarm."""
+    """Leave marks intact, outdated, torn or missing: never synced, they must never raise an alarm."""
     for mark in folder.rglob("*-mark"):
         match rng.randrange(4):
             case 0:
@@ -118,7 +117,7 @@ def wear_marks(folder: Path, rng: random.Random) -> None:
 
 
 def judge(outcome: FaultOutcome, promises: str, left: Remains) -> None:
-    """Compare what is there with what was promised, and add to the counts."""
+    """Compare data with promises and add to the counts."""
     promised = _promised(promises)
     outcome.recorded += len(promised)
     kept = sum(not may_be.isdisjoint(left.contents.get(identity, ())) for identity, may_be in promised.items())
@@ -131,7 +130,7 @@ def judge(outcome: FaultOutcome, promises: str, left: Remains) -> None:
 
 
 def _promised(promises: str) -> dict[SampleNumber, set[str]]:
-    """What each sample may be."""
+    """Permitted contents per sample."""
     promised: dict[SampleNumber, set[str]] = {}
     for sign, spool_id, seq, *content in (line.split() for line in promises.splitlines()):
         if sign == "+":
@@ -144,7 +143,7 @@ def _promised(promises: str) -> dict[SampleNumber, set[str]]:
 
 
 def _look_at_spool(folder: Path) -> Remains:
-    """Open what is left, and take everything out of it."""
+    """Open and empty the remaining spool."""
     contents: dict[SampleNumber, list[str]] = {}
     try:
         spool = Spool(folder / work.SPOOL_FILE, SpoolConfig())
@@ -161,7 +160,7 @@ def _look_at_spool(folder: Path) -> Remains:
 
 
 def _look_at_store(folder: Path) -> Remains:
-    """Open what is left, read it, fold it anew, and send one more batch."""
+    """Open, read and fold the remaining store, and send another batch."""
     contents: dict[SampleNumber, list[str]] = {}
     config = ServerConfig()
     try:
@@ -219,7 +218,7 @@ def writes(scenario: FaultRun) -> FaultOutcome:
 
 
 def sweep(what: str, disk: FailingDisk, folder: Path, seed: int, stride: int) -> FaultOutcome:
-    """Have the n-th write fail, for every n or each stride-th."""
+    """Fail the n-th write, for all n or each stride-th."""
     outcome = FaultOutcome(what)
     for n in range(0, MOST, stride):
         used, promised = folder / str(n), folder.with_name(f"{what}-{n}.promises")

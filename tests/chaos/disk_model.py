@@ -1,8 +1,7 @@
-"""A disk that loses power: which bytes are there afterwards, of a sequence of writes, syncs and names.
+"""A disk that loses power: surviving bytes after writes, syncs and renames.
 
-What was synced is there. Of what was written to a file since its last sync any part may be: each write whole, in part
-by sectors, or not at all, in any order. Names (made, renamed, removed) come in their order, and any sync makes those
-before it durable, as on file systems with a journal (ext4, XFS).
+Synced data survives. Each unsynced write may survive fully, in sectors, or not, in any order. Name changes keep their
+order, and any sync makes earlier ones durable, as on journalling file systems (ext4, XFS).
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ _HEADER = struct.Struct("<qqqq")
 
 
 class Kind(IntEnum):
-    """Operations as disk_shim.c numbers them."""
+    """Operations, numbered as in disk_shim.c."""
 
     WRITE = 1
     TRUNCATE = 2
@@ -31,7 +30,7 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Operation:
-    """One of them. data: the bytes written, or the new name."""
+    """data: bytes written, or the new name."""
 
     kind: Kind
     name: str
@@ -40,7 +39,7 @@ class Operation:
 
 
 def read_trace(path: Path) -> Iterator[Operation]:
-    """Operations that the shim has written down."""
+    """Operations recorded by the shim."""
     text, at = path.read_bytes(), 0
     while at + _HEADER.size <= len(text):
         kind, name_n, offset, n = _HEADER.unpack_from(text, at)
@@ -53,7 +52,7 @@ def read_trace(path: Path) -> Iterator[Operation]:
 
 @dataclass
 class _File:
-    """Durable bytes, and what was done since the last sync."""
+    """Durable bytes, and operations since the last sync."""
 
     durable: bytearray = field(default_factory=bytearray)
     pending: list[Operation] = field(default_factory=list)
@@ -65,11 +64,9 @@ class _File:
 
 
 class Disk:
-    """Files of one folder tree."""
-
     def __init__(self) -> None:
         self._names: dict[str, _File] = {}
-        self._was: list[dict[str, _File]] = [{}]  # names since the last sync, the durable ones first
+        self._was: list[dict[str, _File]] = [{}]  # names since the last sync, durable ones first
 
     def do(self, operation: Operation) -> None:
         name = operation.name
@@ -84,7 +81,7 @@ class Disk:
             self._was.append(dict(self._names))
 
     def cut(self, rng: random.Random, folder: Path) -> None:
-        """Write what may be there after a power cut into an empty folder."""
+        """Write a possible state after a power cut into an empty folder."""
         for name, file in rng.choice(self._was).items():
             image, share = bytearray(file.durable), rng.choice((0.0, 0.5, 0.9, 1.0))
             for operation in file.pending:

@@ -1,4 +1,4 @@
-"""The LD_PRELOAD shim (disk_shim.c): built once, switched from here."""
+"""The LD_PRELOAD shim (disk_shim.c): building and control."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _ALL = 2**31 - 1
 
 
 class DiskError(IntEnum):
-    """How a disk fails."""
+    """Failure modes."""
 
     FULL = errno.ENOSPC
     BROKEN = errno.EIO
 
 
 def build(folder: Path) -> Path | None:
-    """Compile the shim; None where there is no C compiler."""
+    """Compile the shim; None without a C compiler."""
     compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if not compiler:
         return None
@@ -36,7 +36,7 @@ def build(folder: Path) -> Path | None:
 
 
 class FailingDisk:
-    """Files below one folder, as the processes see them that are started with `env`."""
+    """Files below one folder, for processes started with `env`."""
 
     def __init__(self, library: Path, folder: Path, control: Path) -> None:
         self._control = control
@@ -44,23 +44,23 @@ class FailingDisk:
         self.env = {"LD_PRELOAD": str(library), "CHAOS_DISK": str(folder), "CHAOS_FAULT": str(control)}
 
     def set(self, error: int, *, after: int = 0, times: int = _ALL) -> None:
-        """Have writes fail from now on; after: so many still succeed, times: so many then fail."""
+        """Make writes fail; after: successes first, times: number of failures."""
         with self._control.open("r+b" if self._control.exists() else "wb") as file:
             os.pwrite(file.fileno(), _CONTROL.pack(error, after, times), 0)
 
     @property
     def left(self) -> int:
-        """How many operations of those asked for have not failed yet."""
+        """Requested failures still to come."""
         return int(_CONTROL.unpack(self._control.read_bytes())[2])
 
     @property
     def failed(self) -> int:
-        """How many operations have failed since the last `set` without a number."""
+        """Failures since the last unbounded `set`."""
         return _ALL - self.left
 
     @contextmanager
     def failing(self, error: DiskError) -> Iterator[None]:
-        """Every write fails inside of the block."""
+        """All writes fail inside the block."""
         self.set(error)
         try:
             yield

@@ -1,4 +1,4 @@
-"""Machines that are no processes: they send what a scenario makes up, and note what was acknowledged as agents do."""
+"""Machines without process: they send synthetic samples and record acknowledgements like agents."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.chaos.recordings import START_NS
 
 
 class Guest:
-    """One such machine. Its audit file has what the server has acknowledged."""
+    """One guest; its audit file has acknowledged samples."""
 
     def __init__(self, site: ChaosSite, name: str) -> None:
         self.name = name
@@ -28,7 +28,7 @@ class Guest:
         site.guests += (name,)
 
     def send(self, rows: Table) -> str:
-        """Send samples until the server takes or refuses them; returns why it refuses them, empty where it does not."""
+        """Send samples until taken or refused; returns the reason of refusal, or empty."""
         batch = SampleBatch(self.name, 1, self._seq + 1, rows, self._site.frame)
         key, data = keys.ingest(self._site.name, self.name), encode_batch(batch)
         for _ in range(round(RESUME_S)):
@@ -48,7 +48,7 @@ class Guest:
 
 
 def made_up(x_m: AnyArray, y_m: AnyArray, first_s: float, step_s: float, std_m: float, distance_m: float) -> Table:
-    """Samples at places, (n,), of a machine that states their standard deviation and what it drove for each."""
+    """Samples (n,) at places, with stated standard deviation and distance each."""
     rows = empty(len(x_m))
     rows["stamp_ns"] = START_NS + np.round((first_s + step_s * np.arange(len(x_m))) * 1e9).astype(np.int64)
     rows["x_m"], rows["y_m"], rows["distance_m"] = x_m, y_m, distance_m

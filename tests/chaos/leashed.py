@@ -1,4 +1,4 @@
-"""A child process on a leash: it ends with the suite, however that ends."""
+"""A child process that ends with the suite, however that ends."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-END_S = 10.0  # after SIGTERM; then it is killed
-# The kernel kills the children of a suite that was itself killed.
+END_S = 10.0  # after SIGTERM, before SIGKILL
+# The kernel kills the children of a killed suite.
 LEASH = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
 
 
 class Process:
-    """One child, its output in files."""
+    """One child with output files."""
 
     def __init__(self, log: Path, command: Sequence[str], env: Mapping[str, str]) -> None:
         self.log = log
@@ -34,7 +34,7 @@ class Process:
 
     @property
     def code(self) -> int | None:
-        """Exit code, None while it runs."""
+        """Exit code, None while running."""
         return self._process.poll()
 
     def send(self, number: signal.Signals) -> None:
@@ -42,21 +42,20 @@ class Process:
             self._process.send_signal(number)
 
     def said(self, key: str) -> bool:
-        """Whether a line with this key was printed."""
         return f'"{key}":' in self.log.with_suffix(".out").read_text(encoding="utf-8")
 
     def line(self, key: str) -> Any:
-        """The value of the line that was printed with this key, None where there is none."""
+        """Value of the line printed with this key, or None."""
         lines = self.log.with_suffix(".out").read_text(encoding="utf-8").splitlines()
         return next((json.loads(line)[key] for line in lines if line.startswith(f'{{"{key}":')), None)
 
     def last_words(self) -> str:
-        """The last line on standard error."""
+        """Last line on standard error."""
         lines = self.log.with_suffix(".err").read_text(encoding="utf-8", errors="replace").splitlines()
         return lines[-1][:300] if lines else ""
 
     def end(self, *numbers: signal.Signals) -> int:
-        """End it by signals, in the end by SIGKILL; returns the exit code."""
+        """End it by signals, finally SIGKILL; returns the exit code."""
         for number in numbers:
             self.send(number)
         try:

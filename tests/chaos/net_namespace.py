@@ -1,4 +1,4 @@
-"""Two network namespaces with a cable between them, one for the site's office and one for its machines."""
+"""Two network namespaces, office and machines, connected by a cable."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ OFFICE_IP, MACHINES_IP = "10.197.61.1", "10.197.61.2"
 
 
 class NotPermittedError(Exception):
-    """This system does not let the suite do that; the message says what."""
+    """The system forbids it; the message says what."""
 
 
 class Cable:
-    """The pair of namespaces, removed when the block is left."""
+    """The namespaces, for the length of the block."""
 
     def __init__(self) -> None:
         self.office, self.machines = (f"chaos-{os.getpid()}-{side}" for side in ("office", "machines"))
@@ -42,12 +42,12 @@ class Cable:
 
     @staticmethod
     def inside(name: str) -> tuple[str, ...]:
-        """What to put before a command to run it in a namespace."""
+        """Command prefix to run in a namespace."""
         return ("ip", "netns", "exec", name)
 
     @contextmanager
     def down(self) -> Iterator[None]:
-        """Pull the cable at the machines' end, and plug it in again."""
+        """Unplug the machines' end for the block."""
         link = ("ip", "-n", self.machines, "link", "set", "veth0")
         _run(*link, "down")
         yield
@@ -55,7 +55,7 @@ class Cable:
 
     @contextmanager
     def slow(self, kbit_s: int) -> Iterator[None]:
-        """Make both directions slow."""
+        """Slow both directions for the block."""
         where, rate = ("dev", "veth0", "root"), ("rate", f"{kbit_s}kbit", "burst", "4kb", "latency", "400ms")
         for name in (self.office, self.machines):
             _run("tc", "-n", name, "qdisc", "replace", *where, "tbf", *rate)

@@ -1,4 +1,4 @@
-"""What a fault did: counts, the longest pause, and whether that is what was promised."""
+"""Outcome of a fault: counts, longest pause, verdict."""
 
 from __future__ import annotations
 
@@ -19,20 +19,18 @@ LINE = "{:<17}{:>6}{:>10}{:>9}{:>10}{:>6}{:>7}{:>8}{:>8}{:>13}{:>15}{:>8}{:>8}  
 
 
 class InterruptError(Exception):
-    """The suite is to end now."""
+    """The suite must end now."""
 
 
 @dataclass
 class FaultOutcome:
     """Result of one fault.
 
-    count: how often it struck; recorded: samples in the audit files; declared: those that are in no journal and were
-    declared lost to the server; lost: those that are in no journal and were not; named: those of the lost that the
-    server names as missing, by machine and number; silent: the others. ack_ms_max: the longest time from the first
-    sending of a batch until it was acknowledged, as agents that ended in order report it; longest_pause_s: between two
-    commits of one machine, without the time that faults lasted; both None where no agents run. memory_ratio: the
-    server's peak, as a multiple of what it has with one reader; answer_s_max: the longest time that this reader waited;
-    both None but for faults of readers. skipped: why it did not run.
+    count: strikes. recorded: samples in audit files. declared: not journalled, but declared lost. lost: neither; named:
+    lost ones that the server reports missing, by machine and number; silent: the other lost ones. ack_ms_max: longest
+    time to acknowledgement, from agents that ended in order; longest_pause_s: between commits of one machine, without
+    fault times; both None without agents. memory_ratio: server's peak over that with one reader; answer_s_max: this
+    reader's longest wait; both for reader faults only. skipped: why it did not run.
     """
 
     fault: str
@@ -55,13 +53,13 @@ class FaultOutcome:
 
     @property
     def is_good(self) -> bool:
-        """Nothing lost, nothing double, and nothing else that should not be."""
+        """Nothing lost or double, and no other problem."""
         return self.lost == self.double == self.silent == 0 and not self.problems
 
 
 @dataclass(frozen=True)
 class Console:
-    """Where scenarios print, and the signal that ends them."""
+    """Output of scenarios, and their stop signal."""
 
     line: Any = print
     stop: threading.Event = field(default_factory=threading.Event)
@@ -70,18 +68,18 @@ class Console:
         self.line(text, flush=True)
 
     def wait(self, seconds: float) -> None:
-        """Let time pass; InterruptError if the suite is to end."""
+        """Sleep; InterruptError if the suite must end."""
         if self.stop.wait(max(0.0, seconds)):
             raise InterruptError
 
     def stop_on_signals(self) -> None:
-        """Ctrl-C and SIGTERM end the suite in order: what it started is ended, what it made is removed."""
+        """Ctrl-C and SIGTERM end the suite with cleanup."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: self.stop.set())
 
 
 def longest_pause(commits: Sequence[float], faults: Iterable[TimeSpan], end_s: float) -> float:
-    """The longest time without a commit, from the first one to end_s, without what faults lasted meanwhile."""
+    """Longest time without a commit, from the first to end_s, fault times excluded."""
     times = [*sorted(commits), end_s]
     spans = _united(faults)
     return max((b - a - _covered((a, b), spans) for a, b in pairwise(times)), default=0.0)

@@ -1,4 +1,4 @@
-"""Faults that meet samples which wait for the smoother: agents killed with a full window, sensors that fall silent."""
+"""Faults with samples pending in the smoother: agents killed with a full window, silent sensors."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from tests.chaos.outcome import FaultOutcome
 from tests.chaos.recordings import PARKED, SECONDS
 from tests.chaos.scenario import FaultRun
 
-FAST = 8.0  # times real time: a window of 90 s is full after a quarter of a minute
-STRIKES = 4  # of the whole suite: how often all agents are killed
-LEAST_PENDING = 200  # samples in a full window, at least: 90 s at 2 m/s have 360
+FAST = 8.0  # real time factor: a 90 s window fills in 15 s
+STRIKES = 4  # kills of all agents, in the whole suite
+LEAST_PENDING = 200  # in a full window: 90 s at 2 m/s have 360
 
 
 def window(scenario: FaultRun) -> FaultOutcome:
-    """Kill -9 of all agents, each with a minute and a half of samples that wait for the smoother."""
+    """Kill -9 all agents, each with 90 s of pending samples."""
     strikes = scenario.strikes or max(2, round(STRIKES * scenario.scale))
     with _site(scenario) as site:
         site.start_all()
         pending: list[int] = []
         for _ in range(strikes):
-            site.wait_runs()  # the first samples of every run have come: it has as many behind them as the lag holds
+            site.wait_runs()  # each run's first samples are journalled, so its window is full
             for machine in site.machines:
                 with site.fault():
                     site.put_down(machine)
@@ -40,7 +40,7 @@ def window(scenario: FaultRun) -> FaultOutcome:
 
 
 def parked(scenario: FaultRun) -> FaultOutcome:
-    """Machines that drive, and are then parked with their sensors off, agents and all: nothing stays with them."""
+    """Machines drive, then park with sensors and agents off: no sample stays behind."""
     with _site(scenario) as site:
         site.variant = PARKED
         site.start_all()
@@ -64,7 +64,7 @@ def _site(scenario: FaultRun) -> ChaosSite:
 
 
 def _waiting(site: ChaosSite, machine: str) -> int:
-    """Samples in the spool that a killed agent has left, of which nothing is changed."""
+    """Samples in a killed agent's spool, read from a copy."""
     folder = site.folder / "copy"
     folder.mkdir()
     for path in (site.folder / "spool").glob(f"{machine}.db*"):

@@ -1,8 +1,8 @@
-"""`python -m tests.chaos.power_worker spool|store FOLDER SEED STEPS`: work on one file store, saying what is promised.
+"""`python -m tests.chaos.power_worker spool|store FOLDER SEED STEPS`: work on one file store, with promises.
 
-Runs under the disk shim. FOLDER/promises gets a line after each promise, which the shim puts in order with the writes:
-`+ <spool_id> <seq> <hash>` is on disk, `? <spool_id> <seq> <hash>` may take its place from here on,
-`- <spool_id> <seq>` says that samples up to there may be deleted from here on.
+Runs under the disk shim, which orders the lines of FOLDER/promises with the writes: `+ <spool_id> <seq> <hash>` is on
+disk; `? <spool_id> <seq> <hash>` may replace it from here on; `- <spool_id> <seq>`: samples up to it may be deleted
+from here on.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SITE = SiteConfig(name="paper", origin_lat_deg=49.01, origin_lon_deg=8.4)
 
 
 class Promises:
-    """The file of promises; it is not part of what is hit."""
+    """File of promises, exempt from faults."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("ab", buffering=0)
@@ -43,17 +43,17 @@ class Promises:
         self._file.close()
 
     def kept(self, spool_id: int, first_seq: int, rows: Table, sign: str = "+") -> None:
-        """Say that samples are on disk."""
+        """Promise samples on disk."""
         lines = [f"{sign} {spool_id:x} {first_seq + i} {content_hash(row)}\n" for i, row in enumerate(rows)]
         self._file.write("".join(lines).encode())
 
     def given_up(self, spool_id: int, upto: int) -> None:
-        """Say that samples are going to be deleted."""
+        """Announce deletions."""
         self._file.write(f"- {spool_id:x} {upto}\n".encode())
 
 
 def drive(rng: np.random.Generator, n: int, first_ns: int) -> Table:
-    """Samples that no other batch has."""
+    """Unique samples."""
     rows = empty(n)
     rows["stamp_ns"] = first_ns + np.arange(n)
     rows["x_m"], rows["y_m"] = rng.uniform(0, 60, (2, n))
@@ -63,10 +63,10 @@ def drive(rng: np.random.Generator, n: int, first_ns: int) -> Table:
 
 
 def use_spool(folder: Path, promises: Promises, seed: int, steps: int, *, careless: bool = False) -> None:
-    """Record, make final and acknowledge by chance. careless: with the setting that loses rows."""
+    """Record, finalise and acknowledge at random. careless: with settings that lose rows."""
     rng, chance, spool, waiting = np.random.default_rng(seed), random.Random(seed), None, empty()
     for step in range(steps):
-        with suppress(StoreError, sqlite3.Error):  # a disk that fails: nothing was promised
+        with suppress(StoreError, sqlite3.Error):  # disk failure: nothing was promised
             spool = spool or Spool(folder / SPOOL_FILE, SpoolConfig())
             _sync(spool._db, careless)
             rows, finals = (
@@ -88,12 +88,12 @@ def use_spool(folder: Path, promises: Promises, seed: int, steps: int, *, carele
             spool.close()
             spool, waiting = None, empty()
     if spool:
-        spool._db.close()  # as a kill leaves it
+        spool._db.close()  # as after a kill
         spool._mark.close()
 
 
 def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, careless: bool = False) -> None:
-    """Send batches, some twice, with a snapshot now and then. careless: as above."""
+    """Send batches, some twice, with occasional snapshots. careless: as above."""
     rng, chance, store = np.random.default_rng(seed), random.Random(seed), None
     waiting, done = empty(), 0
     for step in range(steps):
@@ -115,7 +115,7 @@ def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, carele
 
 
 def mark_before_commit() -> None:
-    """Have the journal write its mark too early: it then claims what a power cut may take away."""
+    """Make the journal write its mark too early, claiming what a power cut may remove."""
     commit = SqliteJournal.commit
 
     def hasty(journal: SqliteJournal) -> None:

@@ -1,6 +1,6 @@
-"""A reader that behaves badly: `python -m tests.chaos.reader KIND ENDPOINT SITE`.
+"""A misbehaving reader: `python -m tests.chaos.reader KIND ENDPOINT SITE`.
 
-Written against the wire, not the client, so that it can ask for more than the client would. Ends when it is killed.
+Written against the wire, to ask for more than the client would. Runs until killed.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ LARGEST = "region?bounds=-2000,-2000,1999.5,1999.5"  # 16,000,000 cells: the doc
 PIECE = "region?bounds=-128,-128,127.5,127.5;layers=visits,weight,age_s"  # the largest single answer
 AT_ONCE = 20
 WAITING = 300
-BEFORE_SLEEP_S = 0.03  # for questions to leave
+BEFORE_SLEEP_S = 0.03  # for queries to leave
 
 Ask = Callable[[str], "zenoh.Handler[zenoh.Reply]"]
 
 
 def sleeping(ask: Ask) -> None:
-    """Ask for the largest region as many others do, and for some pieces, and take no byte of the answers."""
+    """Query the largest region concurrently, and some pieces; read nothing."""
     held = [ask(LARGEST), *(ask(PIECE) for _ in range(AT_ONCE))]
     time.sleep(BEFORE_SLEEP_S)
     os.kill(os.getpid(), signal.SIGSTOP)
@@ -37,7 +37,7 @@ def sleeping(ask: Ask) -> None:
 
 
 def leaving(ask: Ask) -> None:
-    """Ask, and be gone in mid-answer."""
+    """Query, and leave in mid-answer."""
     held = [ask(LARGEST), *(ask(PIECE) for _ in range(AT_ONCE))]
     time.sleep(BEFORE_SLEEP_S)
     os.kill(os.getpid(), signal.SIGKILL)
@@ -45,7 +45,7 @@ def leaving(ask: Ask) -> None:
 
 
 def looping(ask: Ask) -> None:
-    """Ask for large regions without end, some pieces of each, and never pause."""
+    """Query large regions and some of their pieces endlessly."""
     for attempt in itertools.count():
         for reply in ask(LARGEST):
             if reply.ok is not None and (piece := msgpack.unpackb(reply.ok.payload.to_bytes()).get("piece")):
@@ -55,7 +55,7 @@ def looping(ask: Ask) -> None:
 
 
 def greedy(ask: Ask) -> None:
-    """Ask for what reads most of the ground that is known, one after the other."""
+    """Query what reads the most known ground, sequentially."""
     zigzag = ",".join(f"{x},{y}" for n, y in enumerate(range(0, 1800, 60)) for x in ((0, 1790), (1790, 0))[n % 2])
     for query in itertools.cycle(
         (
@@ -71,7 +71,7 @@ def greedy(ask: Ask) -> None:
 
 
 def waiting(ask: Ask) -> None:
-    """Wait for a row that never comes, as often as one can, and for the past meanwhile."""
+    """Wait for an impossible row as often as allowed, and query the past."""
     held = [ask("info?after=1000000000;wait=60") for _ in range(WAITING)]
     held += [ask(f"point?x=0;y=0;as_of={1_750_000_000_000_000_000 + n}") for n in range(AT_ONCE)]
     threading.Event().wait()

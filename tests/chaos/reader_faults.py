@@ -1,4 +1,4 @@
-"""Faults of readers: what one of them does must not reach machines, nor fill the server's memory."""
+"""Reader faults must neither reach machines nor fill the server's memory."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
 
 LONGEST_ACK_MS = 1000
-MOST_MEMORY = 1.5  # of the server: its peak, as a multiple of what it has with one reader that behaves
-LONGEST_ANSWER_S = 5.0  # of a reader that behaves, while others wait
+MOST_MEMORY = 1.5  # server's peak over that with one normal reader
+LONGEST_ANSWER_S = 5.0  # of a normal reader beside others
 SETTLE_S, LASTS_S, PAUSE_S = 4.0, 6.0, 1.0
 EVERY_S = 0.2
-KNOWN_M, LANE_M, STEP_M, SURVEY_MPS = 1800.0, 14.0, 2.5, 25.0  # 3.2 km2 of known ground, below what a question may read
+KNOWN_M, LANE_M, STEP_M, SURVEY_MPS = 1800.0, 14.0, 2.5, 25.0  # 3.2 km2 of known ground, below a query's limit
 SLEEPING = (("sleeping", 10), ("looping", 2), ("leaving", 10))
 WAITING = (("waiting", 3),)
 
 
 def sleeping_reader(scenario: FaultRun) -> FaultOutcome:
-    """Readers that ask for much and are stopped, are gone in mid-answer, or ask without end."""
+    """Readers that stop reading, leave in mid-answer, or query endlessly."""
     return _strike(scenario, SLEEPING)
 
 
 def waiting_reader(scenario: FaultRun) -> FaultOutcome:
-    """Readers that wait for a journal row that never comes, hundreds of times, and ask for the past meanwhile."""
+    """Hundreds of waits for an impossible row, and queries of the past."""
     outcome = _strike(scenario, WAITING)
     if (outcome.answer_s_max or 0.0) > LONGEST_ANSWER_S:
         outcome.problems.append(f"a reader that behaves waited {outcome.answer_s_max} s for an answer")
@@ -45,12 +45,12 @@ def waiting_reader(scenario: FaultRun) -> FaultOutcome:
 
 
 def questions(scenario: FaultRun) -> FaultOutcome:
-    """One reader asks the largest questions that are allowed, over some square kilometres of known ground."""
+    """One reader sends the largest allowed queries over square kilometres."""
     return _strike(scenario, (("greedy", 1),), _know_much)
 
 
 def _know_much(site: ChaosSite) -> None:
-    """Have a fast machine drive all over KNOWN_M x KNOWN_M, to and fro."""
+    """A fast machine drives all over KNOWN_M x KNOWN_M."""
     along_m = np.arange(0.0, KNOWN_M, STEP_M)
     with closing(Guest(site, "surveyor")) as surveyor:
         for number, x_m in enumerate(np.arange(0.0, KNOWN_M, LANE_M)):
@@ -64,7 +64,7 @@ def _know_much(site: ChaosSite) -> None:
 def _strike(
     scenario: FaultRun, kinds: Sequence[tuple[str, int]], prepare: Callable[[ChaosSite], None] | None = None
 ) -> FaultOutcome:
-    """Let each kind of reader come once, and again while there is time; beside them one that behaves."""
+    """Run each kind of reader once, then repeatedly, beside a normal one."""
     with scenario.site() as site:
         site.start_all()
         if prepare:
@@ -81,7 +81,7 @@ def _strike(
     outcome.memory_ratio, outcome.answer_s_max = round(peak_mb / idle_mb, 2), round(longest_s, 2)
     if outcome.memory_ratio > MOST_MEMORY:
         outcome.problems.append(f"the server took {outcome.memory_ratio} times the memory that one reader needs")
-    if not prepare and (outcome.ack_ms_max or 0) > LONGEST_ACK_MS:  # else batches of what is prepared may wait
+    if not prepare and (outcome.ack_ms_max or 0) > LONGEST_ACK_MS:  # else prepared batches may wait
         outcome.problems.append(f"an acknowledgement took {outcome.ack_ms_max} ms")
     return outcome
 
@@ -108,20 +108,20 @@ def _come_and_go(scenario: FaultRun, site: ChaosSite, kinds: Sequence[tuple[str,
 
 
 class Asker:
-    """One that behaves, on a thread of its own: asks now and then, and notes how long that takes.
+    """A normal reader on its own thread that measures its waiting times.
 
-    ask: raises where it is refused, or not answered. answers: how many it has.
+    ask: raises if refused or unanswered. answers: count.
     """
 
     def __init__(self, ask: Callable[[], object]) -> None:
         self.answers, self._longest_s = 0, 0.0
-        self._asked_s: float | None = None  # since when it waits
+        self._asked_s: float | None = None  # waiting since
         self._ask, self._stop = ask, threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def longest_s(self) -> float:
-        """How long it waited at most, for an answer that has not come yet too."""
+        """Longest wait, including a pending one."""
         asked_s = self._asked_s
         return max(self._longest_s, time.monotonic() - asked_s if asked_s else 0.0)
 
@@ -135,7 +135,7 @@ class Asker:
     def _run(self) -> None:
         while not self._stop.wait(EVERY_S):
             self._asked_s = time.monotonic()
-            with suppress(SitegridError, OSError, HTTPException):  # refused, or not answered: as long as that took
+            with suppress(SitegridError, OSError, HTTPException):  # refused or unanswered: counted by duration
                 self._ask()
                 self.answers += 1
             self._longest_s, self._asked_s = self.longest_s(), None

@@ -1,7 +1,7 @@
-"""What machines of the suite read: a recording of the simulator, replayed from another instant at every start.
+"""Input of the suite's machines: one simulated recording, replayed at another time on every start.
 
-One recording replayed twice from the same instant would give the same samples twice; the time columns count from the
-manifest's `start_ns`, so a manifest of its own makes each start a drive of its own.
+A replay at the same time would repeat samples; time columns count from the manifest's `start_ns`, so each start gets
+its own manifest.
 """
 
 from __future__ import annotations
@@ -16,24 +16,23 @@ from sim.recorder import record
 from sim.simulator import START_NS
 
 SECONDS = 160
-SPEED = 4.0  # times real time: about 25 samples a second and machine
-IDLE, PARKED = "idle", "parked"  # variants of a recording: without a reading; with nothing more for an hour at its end
+SPEED = 4.0  # real time factor: about 25 samples/s per machine
+IDLE, PARKED = "idle", "parked"  # variants of a recording: no reading; silence for an hour at the end
 HOUR_NS = 3600 * 10**9
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """Recordings of some machines in one folder. clock: of the site."""
+    """Recordings of machines in one folder. clock: the site's."""
 
     folder: Path
     machines: tuple[str, ...]
 
     def data(self, machine: str) -> Path:
-        """Folder of a machine's CSV files."""
         return self.folder / machine
 
     def manifest(self, path: Path, machine: str, first_ns: int, variant: str = "") -> Path:
-        """Write a manifest of a drive that begins at first_ns. variant: IDLE or PARKED."""
+        """Write a manifest for a drive starting at first_ns. variant: IDLE or PARKED."""
         text = (self.data(machine) / "log.toml").read_text(encoding="utf-8")
         head, rest = text.split("\n[site]", 1)
         text = f"{head}start_ns = {first_ns - START_NS}\n\n[site]{rest}"
@@ -42,7 +41,7 @@ class Recordings:
 
 
 def make(folder: Path, machines: int, seed: int, seconds: float = SECONDS, stop: Event | None = None) -> Recordings:
-    """Record machines that drive; stop: once set, the recording ends with what it has."""
+    """Record machines; stop ends the recording early."""
     folder.mkdir(parents=True, exist_ok=True)
     simulator = record(SimConfig(world="fast", machines=machines, seconds=seconds, seed=seed), folder, stop=stop)
     names = tuple(machine.name for machine in simulator.machines)
@@ -57,7 +56,7 @@ def make(folder: Path, machines: int, seed: int, seconds: float = SECONDS, stop:
 
 
 def _park(source: Path, target: Path) -> None:
-    """A copy whose last reading comes again an hour later: until then a replay waits, as for sensors that are off."""
+    """A copy with its last reading repeated an hour later: the replay waits, like for silent sensors."""
     text = source.read_text(encoding="utf-8")
     stamp, values = text.splitlines()[-1].split(",", 1)
     target.write_text(f"{text}{int(stamp) + HOUR_NS},{values}\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What every scenario is given, and what it draws from the seed."""
+"""Input of every scenario, and its draws from the seed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.chaos.recordings import Recordings
 
 @dataclass(frozen=True)
 class Spell:
-    """A fault that lasts for a while: inside of the block."""
+    """A fault that lasts for the block."""
 
     words: str
     lasts_s: float
@@ -27,8 +27,8 @@ class Spell:
 class FaultRun:
     """One fault's run.
 
-    folder: its own. seconds: how long faults strike. scale: how much of the whole suite, 0 to 1. strikes: how often to
-    strike, where that can be said; 0 for what scale gives.
+    folder: its own. seconds: of faults. scale: share of the whole suite, 0 to 1. strikes: number of strikes, 0: by
+    scale.
     """
 
     fault: str
@@ -42,7 +42,7 @@ class FaultRun:
 
     @property
     def rng(self) -> random.Random:
-        """Random numbers of this fault alone: the same whatever else runs."""
+        """Generator of this fault, independent of the others."""
         return random.Random(f"{self.seed} {self.fault}")
 
     def site(self, **options: Any) -> ChaosSite:
@@ -54,7 +54,7 @@ class FaultRun:
     def strike(
         self, site: ChaosSite, draw: Callable[[random.Random, int], Spell], counts: Sequence[int] | None = None
     ) -> FaultOutcome:
-        """Start a site and have one spell follow the other, each after a pause. counts: of each spell, where not 1."""
+        """Start a site and strike repeatedly with pauses. counts: per spell, default 1."""
         rng, left_s, n = self.rng, self.seconds, 0
         site.start_all()
         while left_s > 0:

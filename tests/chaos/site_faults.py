@@ -1,4 +1,4 @@
-"""Faults of processes, links, clocks and disks that strike a site of real processes while it works."""
+"""Faults of processes, links, clocks and disks on a working site."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun, Spell
 from tests.tcp_proxy import FAIR, Proxy, Weather
 
-KILLS = 250  # of the whole suite; never fewer than LEAST
+KILLS = 250  # in the whole suite, at least LEAST
 LEAST = 100
-FREEZES_S = (1.0, 3.5, 8.0, 13.0)  # shorter and longer than an ack's time-out (3 s) and a link's lease (10 s)
+FREEZES_S = (1.0, 3.5, 8.0, 13.0)  # around an acknowledgement's timeout (3 s) and a link's lease (10 s)
 CABLE_S = (1.0, 4.0, 8.0, 14.0)
 MACHINES = "machines"
 DRIVES_BEFORE_NS = 105 * 60 * 10**9
@@ -28,9 +28,9 @@ STEPS_S = (
     {SERVER: -HOUR_S},
     {MACHINES: HOUR_S},
     {MACHINES: -HOUR_S},
-    {SERVER: -HOUR_S, MACHINES: HOUR_S},  # samples come from the future, and are refused until the server is back
+    {SERVER: -HOUR_S, MACHINES: HOUR_S},  # samples from the future, refused until the server is back
 )
-# What SQLite and the system say; a process that starts on such a disk has to end, and is started again.
+# Messages of SQLite and the system; such processes must end and are restarted.
 EXCUSES = (
     *("disk I/O error", "database or disk is full", "unable to open database file"),
     *("No space left", "Input/output"),
@@ -38,7 +38,7 @@ EXCUSES = (
 
 
 class Storm(Enum):
-    """Weather, and how long it may last [s]: a hold is shorter and longer than an ack's time-out and a link's lease."""
+    """Weather and durations [s]: holds around an acknowledgement's timeout and a link's lease."""
 
     CUT = Weather(cut=True), (0.5, 2.0, 6.0)
     BLACK_HOLE = Weather(hold_there=True, hold_back=True), (1.0, 4.0, 12.0)
@@ -49,7 +49,7 @@ class Storm(Enum):
 
 
 def draw_kills(rng: random.Random, machines: tuple[str, ...], n: int, seconds: float) -> list[tuple[float, str]]:
-    """Victims, and how long to wait before each [s], together `seconds`: bursts, and calms in which work is done."""
+    """Victims with pauses before each [s], `seconds` in total: bursts and calms."""
     victims = [*machines, *(ROUTER, SERVER) * 2]
     pauses = [rng.expovariate(1.0) ** 2 for _ in range(n)]
     scale = seconds / sum(pauses)
@@ -57,7 +57,7 @@ def draw_kills(rng: random.Random, machines: tuple[str, ...], n: int, seconds: f
 
 
 def kills(scenario: FaultRun) -> FaultOutcome:
-    """Kill -9 of agents, server and router in random order, also while they start."""
+    """Kill -9 agents, server and router in random order, even while starting."""
     n = scenario.strikes or max(LEAST, round(KILLS * scenario.scale))
     with scenario.site() as site:
         plan = draw_kills(scenario.rng, site.machines, n, scenario.seconds)
@@ -70,7 +70,7 @@ def kills(scenario: FaultRun) -> FaultOutcome:
 
 
 def freezes(scenario: FaultRun) -> FaultOutcome:
-    """SIGSTOP of server and router for a while, then SIGCONT."""
+    """SIGSTOP server and router for a while."""
 
     @contextmanager
     def frozen(victim: str) -> Iterator[None]:
@@ -87,7 +87,7 @@ def freezes(scenario: FaultRun) -> FaultOutcome:
 
 
 def proxy(scenario: FaultRun) -> FaultOutcome:
-    """Bad weather between agents and router, or between server and router."""
+    """Bad weather between agents or server and router."""
     storms = scenario.rng.sample(list(Storm), len(Storm))
 
     @contextmanager
@@ -112,7 +112,7 @@ def proxy(scenario: FaultRun) -> FaultOutcome:
 
 
 def cable(scenario: FaultRun) -> FaultOutcome:
-    """Machines in a network namespace of their own, whose link goes down or gets slow."""
+    """Machines in their own network namespace; the link goes down or slow."""
 
     def draw(rng: random.Random, _: int) -> Spell:
         kbit_s, lasts_s = rng.choice((64, 300)), rng.choice(CABLE_S)
@@ -132,9 +132,9 @@ def cable(scenario: FaultRun) -> FaultOutcome:
 
 
 def clocks(scenario: FaultRun) -> FaultOutcome:
-    """Step the wall clock of the server or of all machines by an hour, and back; the site refuses what is to come.
+    """Step the wall clock of server or machines by an hour and back; future samples are refused.
 
-    The server is also started anew while its clock is wrong: then it archives what looks old.
+    The server is also restarted with its wrong clock: it then archives what looks old.
     """
     counts: list[int] = []
 
@@ -165,7 +165,7 @@ def clocks(scenario: FaultRun) -> FaultOutcome:
 
 
 def disks(scenario: FaultRun) -> FaultOutcome:
-    """Every write of the store, or of all spools, fails for some seconds; sometimes the process is killed in it."""
+    """All writes of store or spools fail for seconds; sometimes the process is killed meanwhile."""
     counts: list[int] = []
 
     @contextmanager

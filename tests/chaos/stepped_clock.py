@@ -1,7 +1,7 @@
-"""`python -m tests.chaos.stepped_clock FILE ...`: `sitegrid ...` under a clock that is FILE's nanoseconds off.
+"""`python -m tests.chaos.stepped_clock FILE ...`: `sitegrid ...` with a clock off by FILE's nanoseconds.
 
-Only the wall clock is stepped, as by a person or by NTP: monotonic clocks and waits go on (`faketime` breaks both).
-Readings are stamped by the machine's clock, so a replayed reading is stamped as that clock would.
+Only the wall clock is stepped; monotonic clocks and waits continue (`faketime` breaks both). Replayed readings are
+stamped by the machine's stepped clock.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ OFF = struct.Struct("<q")
 
 
 def write(path: Path, off_ns: int) -> None:
-    """Step the clock of all processes that run under a file."""
+    """Step the clock of all processes under a file."""
     with path.open("r+b" if path.exists() else "wb") as file:
         file.write(OFF.pack(off_ns))
 
@@ -45,6 +45,6 @@ def _step_clocks(path: Path) -> None:
 
 if __name__ == "__main__":
     _step_clocks(Path(sys.argv[1]))
-    from sitegrid.cli import main  # after the clocks are stepped
+    from sitegrid.cli import main  # after stepping the clocks
 
     sys.exit(main(sys.argv[2:]))

@@ -1,4 +1,4 @@
-"""Faults that set stores and times against each other: a second map server, stamps and clocks that are years off."""
+"""Conflicts of stores and times: a second map server, stamps and clocks off by years."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from tests.tcp_proxy import FAIR, Proxy, Weather
 
 YEAR_S = 365 * 24 * HOUR_S
 DAY_NS = 24 * HOUR_S * 10**9
-ALONE_S = 4.0  # a second server has the site to itself
-WRONG_S = 3.0  # a clock is wrong
+ALONE_S = 4.0  # of a second server
+WRONG_S = 3.0  # of a clock
 RUNS = "a map server runs already"
 OTHER_WRITES, TAKEN_OVER = "another map server writes", "another map server takes over"
 
 
 def second_server(scenario: FaultRun) -> FaultOutcome:
-    """A map server of the site on another store: beside the first, while that is cut off, and with --take-over.
+    """A second map server with another store: beside the first, without it, and with --take-over.
 
-    The first one's samples stay its own: what the second is offered of runs that are bound to the first, it refuses.
+    The second one must refuse runs that are bound to the first store.
     """
     with scenario.site() as site, Proxy(int(site.endpoints[ROUTER].rpartition(":")[2])) as of_server:
         site.endpoints[SERVER] = of_server.endpoint
@@ -59,9 +59,9 @@ def second_server(scenario: FaultRun) -> FaultOutcome:
 
 
 def _bind(site: ChaosSite) -> None:
-    """Wait until the first store has acknowledged samples of every run that is being recorded."""
+    """Wait until the first store acknowledged samples of every current run."""
     site.wait_runs()
-    site.console.wait(1.0)  # for the acknowledgements; a drive that ends now is not followed by another one
+    site.console.wait(1.0)  # acknowledgements arrive; an ending drive is not followed by another
 
 
 def _is_refused(site: ChaosSite) -> None:
@@ -82,9 +82,9 @@ def _start_again(site: ChaosSite) -> None:
 
 
 def far_future(scenario: FaultRun) -> FaultOutcome:
-    """One machine stamps the year 2099, and the server's clock is years behind: at first now, then after a new start.
+    """One machine stamps the year 2099, and the server's clock is years behind, then restarted.
 
-    The machine's samples are quarantined and declared, no other one's are, and the site's now stays where it is.
+    Only that machine's samples are quarantined and declared; the site's now stays.
     """
     with scenario.site() as site:
         machine = site.machines[0]
@@ -122,7 +122,7 @@ def _quarantined(site: ChaosSite, machine: str) -> int:
 
 
 def archive_clock(scenario: FaultRun) -> FaultOutcome:
-    """The server's clock is a year ahead for a while; 40 hours after it is right again, all rows are to be archived."""
+    """The server's clock is a year ahead for a while; 40 hours after its correction all rows must be archived."""
     with scenario.site() as site:
         path = site.folder / "clock-server"
         stepped_clock.write(path, 0)
@@ -134,7 +134,7 @@ def archive_clock(scenario: FaultRun) -> FaultOutcome:
         with SqliteReader(site.folder / "store" / JOURNAL_FILE) as reader:
             old = reader.last_row
         stepped_clock.write(path, 40 * HOUR_S * 10**9)
-        site.kill(SERVER)  # a server looks for rows that are old enough when it starts
+        site.kill(SERVER)  # a starting server looks for old rows
         site.wait_ready(SERVER)
         archived = 0
         with SqliteReader(site.folder / "store" / JOURNAL_FILE) as reader:

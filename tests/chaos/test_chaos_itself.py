@@ -1,4 +1,4 @@
-"""The fault suite would see a loss: its models, its verdicts, its command."""
+"""The fault suite detects losses: models, verdicts, command."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A visitor that behaves badly: `python -m tests.chaos.visitor KIND NETWORK PORT SITE`.
+"""A misbehaving visitor: `python -m tests.chaos.visitor KIND NETWORK PORT SITE`.
 
-It opens one connection to the web server after the other and holds the newest HELD, from addresses of its own network
-127.0.NETWORK.x. Ends when it is killed.
+Opens connections to the web server endlessly and holds the newest HELD, from addresses 127.0.NETWORK.x. Runs until
+killed.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import time
 from collections import deque
 from contextlib import suppress
 
-HELD = 500  # connections at a time: as many as there are places for all visitors
-ADDRESSES = 3  # of one visitor: one address alone would fill its own places only
-EVERY_S = 0.05  # between two connections, once all are open
+HELD = 500  # connections: all visitors' capacity
+ADDRESSES = 3  # of one visitor: a single address could only fill its own share
+EVERY_S = 0.05  # between connections, once all are open
 PATIENCE_S = 3.0
-HELLO = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"  # how a handshake of TLS begins
+HELLO = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"  # start of a TLS handshake
 ASK = b"GET /%s HTTP/1.1\r\nHost: 127.0.0.1\r\n%s"
 UPGRADE = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
 UPGRADE += b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-MUCH = (  # the largest answers that there may be
+MUCH = (  # the largest possible answers
     b"region?bounds=-1000,-1000,999,999&layers=resistance,grade,visits,age_s&format=npz",
     b"region?bounds=-250,-250,249,249&layers=resistance,grade,visits,age_s",
     b"features/zones",
@@ -31,40 +31,40 @@ MUCH = (  # the largest answers that there may be
 
 
 def trusting() -> ssl.SSLContext:
-    """TLS that believes any certificate."""
+    """TLS without verification."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     return context
 
 
 class Visitor:
-    """Connections of each kind, each returned as it is to be held."""
+    """Connections by kind, ready to be held."""
 
     def __init__(self, network: int, port: int, site: str) -> None:
         self._network, self._port, self._path = network, port, f"api/v1/sites/{site}/".encode()
         self._numbers, self._tls = itertools.count(), trusting()
 
     def idle(self) -> socket.socket:
-        """A connection that says nothing: its handshake never begins."""
+        """A silent connection, without handshake."""
         source = f"127.0.{self._network}.{1 + next(self._numbers) % ADDRESSES}"
         return socket.create_connection(("127.0.0.1", self._port), PATIENCE_S, source_address=(source, 0))
 
     def shaking(self) -> socket.socket:
-        """A handshake that never ends."""
+        """An endless handshake."""
         opened = self.idle()
         opened.sendall(HELLO)
         return opened
 
     def half(self) -> socket.socket:
-        """A whole request, and half of another one."""
+        """A whole request and a half."""
         return self._asked(ASK % (b"healthz", b"\r\n") + ASK % (b"", b"X-Slow: "))
 
     def sleeping(self) -> socket.socket:
-        """A live page that takes nothing."""
+        """A live page that reads nothing."""
         return self._asked(ASK % (self._path + b"live", UPGRADE))
 
     def asking(self) -> socket.socket:
-        """A large question whose answer is taken in every other time."""
+        """A large query, answered in every other case."""
         number = next(self._numbers)
         asked = self._asked(ASK % (self._path + MUCH[number // 2 % len(MUCH)], b"Connection: close\r\n\r\n"))
         asked.settimeout(20 * PATIENCE_S)
@@ -84,7 +84,7 @@ KINDS = ("idle", "shaking", "half", "sleeping", "asking")
 def main(kind: str, network: str, port: str, site: str) -> None:
     connect, held = getattr(Visitor(int(network), int(port), site), kind), deque[socket.socket](maxlen=HELD)
     while True:
-        with suppress(OSError):  # closed, or refused: the next one comes
+        with suppress(OSError):  # closed or refused: next one
             held.append(connect())
         time.sleep(EVERY_S if len(held) == HELD else 0)
 

@@ -1,4 +1,4 @@
-"""Faults of strangers: visitors of the web server, many at once, and machines that scatter, wander or lie."""
+"""Faults of strangers: crowds at the web server; machines that scatter, wander or lie."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from tests.chaos.recordings import START_NS
 from tests.chaos.scenario import FaultRun
 from tests.chaos.visitor import KINDS, PATIENCE_S, trusting
 
-ROUND_S = 8.0  # at least, from one kill of the server to the next
-ANSWERS = 5  # of each question of a visitor that behaves, in a round
-WEB_MB = 600.0  # that all visitors may cost the web server: of 470, large answers take 320 and sockets 150
-BATCHES = 400  # of each machine that scatters or wanders, in the whole suite
-GUEST_MB = 60.0  # that one of them may cost the map server, whatever it sends
-FAR_M, FAR_DEG = 9000.0, 0.05  # from the origin, and of longitude: where nobody is
+ROUND_S = 8.0  # least time between kills of the server
+ANSWERS = 5  # per normal visitor's query and round
+WEB_MB = 600.0  # cost of all visitors: of 470, large answers take 320 and sockets 150
+BATCHES = 400  # per scattering or wandering machine, in the whole suite
+GUEST_MB = 60.0  # cost of one of them to the map server
+FAR_M, FAR_DEG = 9000.0, 0.05  # from the origin, and in longitude: nobody is there
 
 
 def visitors(scenario: FaultRun) -> FaultOutcome:
-    """Hundreds of sockets of each kind at the web server, and large questions; the map server is killed in between."""
+    """Hundreds of sockets of each kind and large queries, with kills of the map server."""
     rounds = max(2, round(scenario.seconds / ROUND_S))
     with scenario.site() as site:
         site.start_all()
@@ -66,7 +66,7 @@ def visitors(scenario: FaultRun) -> FaultOutcome:
 
 
 def _round(site: ChaosSite, askers: tuple[Asker, ...]) -> None:
-    """Let a while pass, in which each machine has samples acknowledged and each question gets its answers."""
+    """Let all machines get acknowledgements and all queries answers."""
     before, answered = site.progress(), [asker.answers + ANSWERS for asker in askers]
 
     def are_served() -> bool:
@@ -82,7 +82,7 @@ def _round(site: ChaosSite, askers: tuple[Asker, ...]) -> None:
 
 @contextmanager
 def _crowd(site: ChaosSite) -> Iterator[None]:
-    """Visitors of all kinds, each in a process of its own."""
+    """Visitors of all kinds, a process each."""
     port = site.options[WEB][1]
     with ExitStack() as ended:
         for network, kind in enumerate(KINDS, 1):
@@ -93,7 +93,7 @@ def _crowd(site: ChaosSite) -> Iterator[None]:
 
 
 def scatter(scenario: FaultRun) -> FaultOutcome:
-    """Machines that scatter samples over far ground, whose place wanders, or that say that others are elsewhere."""
+    """Machines that scatter samples far away, wander, or state poses of others."""
     rng, batches = np.random.default_rng(scenario.seed), max(40, round(BATCHES * scenario.scale))
     with scenario.site() as site:
         site.start_all()
@@ -130,7 +130,7 @@ def scatter(scenario: FaultRun) -> FaultOutcome:
 
 
 def _start_web(site: ChaosSite) -> None:
-    """Start the web server, with TLS; a person's browser would be told to trust it."""
+    """Start the web server with TLS."""
     now, folder = datetime.now(UTC), site.folder / "tls"
     pair = issue(make_authority(site.name, now, now + timedelta(1)), WEB, now, now + timedelta(1), ("127.0.0.1",))
     folder.mkdir()
@@ -142,7 +142,7 @@ def _start_web(site: ChaosSite) -> None:
 
 
 def _get(site: ChaosSite, path: str) -> bytes:
-    """The web server's answer to a visitor that behaves; HTTPException for any but 200."""
+    """A normal visitor's answer; HTTPException unless 200."""
     with closing(
         HTTPSConnection("127.0.0.1", int(site.options[WEB][1]), timeout=20 * PATIENCE_S, context=trusting())
     ) as connection:
@@ -154,7 +154,7 @@ def _get(site: ChaosSite, path: str) -> bytes:
 
 
 def _poses(site: ChaosSite) -> Iterator[tuple[str, bool]]:
-    """Which machines the page shows, and whether far from all that drives."""
+    """Machines on the page, and whether far from all drives."""
     origin_deg = load_site(site.folder / "site.toml").origin_lon_deg
     for place in json.loads(_get(site, f"/api/v1/sites/{site.name}/features/machines"))["features"]:
         yield place["properties"]["machine"], abs(place["geometry"]["coordinates"][0] - origin_deg) > FAR_DEG

@@ -1,7 +1,4 @@
-"""Reads answers of the map by another hand: written from docs/protocol.md alone.
-
-Imports nothing of this project: what it knows is what the document says.
-"""
+"""An independent reader of map answers, written from docs/protocol.md alone, without this project's code."""
 
 from __future__ import annotations
 
@@ -16,11 +13,11 @@ Layers = dict[str, list[list[float]]]  # rows from the south, each from west to 
 
 
 class RefusedError(Exception):
-    """The server refuses the question."""
+    """The server refuses the query."""
 
 
 def ask(session: Any, site: str, query: str, within_s: float = 10.0, **parameters: object) -> dict[str, Any]:
-    """One answer; asked again while none comes, and where it helps."""
+    """One answer; retried if none comes, and where refusals allow it."""
     selector = f"sitegrid/{site}/map/{query}"
     if parameters:
         selector += "?" + ";".join(f"{name}={value}" for name, value in parameters.items())
@@ -45,7 +42,7 @@ def ask(session: Any, site: str, query: str, within_s: float = 10.0, **parameter
 def region(
     session: Any, site: str, bounds: tuple[float, float, float, float], *layers: str
 ) -> tuple[dict[str, Any], Layers]:
-    """A rectangle, piece by piece where it comes in pieces: its first answer, and the layers of the whole."""
+    """A rectangle, assembled from pieces: its first answer, and all layers."""
     sides = ",".join(map(repr, bounds))
     first = answer = ask(session, site, "region", bounds=sides, **({"layers": ",".join(layers)} if layers else {}))
     piece = first.get("piece")

@@ -1,13 +1,10 @@
-"""A sender of samples by another hand: written from docs/protocol.md alone.
+"""An independent sender of samples, written from docs/protocol.md alone, without this project's code.
 
     python plain_sender.py ENDPOINT FRAME SITE MACHINE SPOOL --samples N --seed S
 
-It makes N samples, records each in its spool (SQLite, synced), and sends them until all are acknowledged: cut anew at
-every attempt, with a time-out that is often too short, and now and then again although it has the acknowledgement. Of
-every 50 samples one is bad. It may be killed at any moment; the next one on the same spool goes on. In the end it
-prints `done`.
-
-Imports nothing of this project: what it knows is what the document says.
+It makes N samples, records each in its spool (SQLite, synced), and sends until all are acknowledged: batches cut anew
+at every attempt, timeouts often too short, and occasional repetitions despite an acknowledgement. One of 50 samples is
+bad. It may be killed at any moment; a new process on the same spool continues. At the end it prints `done`.
 """
 
 from __future__ import annotations
@@ -25,8 +22,8 @@ from typing import Any
 import msgpack
 import zenoh
 
-# It has no calibration of its own, and knows no mass, lanes or fuel: it leaves these columns away.
-COLUMNS = (  # name, format of the struct module
+# Without calibration, mass, lanes and fuel it omits these columns.
+COLUMNS = (  # name, format in the struct module
     *(("stamp_ns", "q"), ("x_m", "d"), ("y_m", "d")),
     *((name, "f") for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "heading_rad", "speed_mps", "distance_m")),
     *((name, "f") for name in ("c_rr", "c_rr_var", "grade_e", "grade_n", "grade_var")),
@@ -42,14 +39,14 @@ Row = tuple[Any, ...]
 
 
 def frame_of(lat_deg: float, lon_deg: float, height_m: float) -> str:
-    """The eight digits of a site's frame."""
+    """A site frame's eight digits."""
     origin = f"+lat_0={lat_deg!r} +lon_0={lon_deg!r}"
     text = f"+proj=tmerc {origin} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs {height_m!r}"
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def sample(seed: int, number: int) -> Row:
-    """The n-th sample that a machine makes; the stamp tells it apart from all others."""
+    """The n-th sample of a machine, unique by its stamp."""
     bad = number % BAD_EVERY == BAD_EVERY - 1
     x_m = float("nan") if bad else 40.0 + number % 60
     place = (START_NS + number * 10**8 + seed, x_m, 20.0 + number // 60 % 40)
@@ -57,7 +54,7 @@ def sample(seed: int, number: int) -> Row:
 
 
 def open_session(endpoint: str) -> Any:
-    """A client of the site's router; waits until it is there."""
+    """A client of the site's router, once it is there."""
     config = zenoh.Config()
     for key, value in (
         ("mode", '"client"'),
@@ -75,7 +72,7 @@ def open_session(endpoint: str) -> Any:
 
 @dataclass
 class Run:
-    """One opening of the spool. newest: last number given out; acknowledged: last number that the server has."""
+    """One opening of the spool. newest: last number recorded; acknowledged: last number at the server."""
 
     id: int
     newest: int
@@ -84,8 +81,6 @@ class Run:
 
 
 class Spool:
-    """Samples on disk until they are acknowledged."""
-
     def __init__(self, path: str) -> None:
         self._db = sqlite3.connect(path, isolation_level=None)
         self._db.executescript(
@@ -109,7 +104,7 @@ class Spool:
             self._db.executemany("INSERT INTO sample VALUES (?, ?, ?)", packed)
 
     def runs(self) -> list[tuple[int, Run]]:
-        """All runs, the oldest first."""
+        """All runs, oldest first."""
         rows = self._db.execute("SELECT place, id, newest, acknowledged, store FROM run ORDER BY place").fetchall()
         return [(place, Run(int(number), *rest)) for place, number, *rest in rows]
 
@@ -117,7 +112,7 @@ class Spool:
         return next(run for at, run in self.runs() if at == place)
 
     def head(self, place: int, most: int) -> tuple[int, list[bytes]]:
-        """The oldest samples of a run that follow each other: number of the first, and all."""
+        """A run's oldest consecutive samples: first number, and all."""
         rows = self._db.execute(
             "SELECT seq, row FROM sample WHERE place = ? ORDER BY seq LIMIT ?", (place, most)
         ).fetchall()
@@ -135,7 +130,7 @@ class Spool:
             self._db.execute("DELETE FROM sample WHERE place = ? AND seq = ?", (place, seq))
 
     def start_run(self) -> None:
-        """What is recorded from here on belongs to a new run."""
+        """Start a new run."""
         words = "INSERT INTO run (id, newest, acknowledged, store) VALUES (?, 0, 0, '')"
         self.place = int(self._db.execute(words, (str(secrets.randbits(64) or 1),)).lastrowid or 0)
 
@@ -155,8 +150,6 @@ class _Transaction:
 
 
 class Sender:
-    """Sends one batch at a time."""
-
     def __init__(self, session: Any, key: str, machine: str, frame: str, spool: Spool, draw: random.Random) -> None:
         self._session, self._key, self._machine, self._frame = session, key, machine, frame
         self.spool, self._draw = spool, draw
@@ -165,7 +158,7 @@ class Sender:
         self._sent: list[bytes] = []
 
     def ask(self, payload: bytes, timeout_s: float) -> dict[str, Any] | None:
-        """The acknowledgement; None where none came, which says nothing."""
+        """The acknowledgement, or None, which proves nothing."""
         replies = list(self._session.get(self._key, payload=payload, timeout=timeout_s))
         for reply in replies:
             if reply.ok is not None:
@@ -184,20 +177,20 @@ class Sender:
         return bytes(msgpack.packb(fields))
 
     def deliver(self, place: int) -> bool:
-        """Send the oldest samples of a run once; False where it has none."""
+        """Send a run's oldest samples once; False if it has none."""
         run = self.spool.run(place)
         first, rows = self.spool.head(place, self._draw.randint(1, self._most))
         if not rows:
             return False
         payload = self.batch(run, first, rows, first - 1 - run.acknowledged)
         self._replay(payload)
-        # Most of the time enough; else the reply may come when nobody waits for it any more.
+        # Usually long enough; else the reply comes too late.
         answer = self.ask(payload, self._draw.choice((3.0, 3.0, 0.002)))
         self._take(place, run, first, len(rows), answer)
         return True
 
     def _take(self, place: int, run: Run, first: int, n: int, answer: dict[str, Any] | None) -> None:
-        """Do what the document says of an answer to a batch."""
+        """Handle a batch's answer by the document."""
         if answer is None:
             self._pause()
             return
@@ -225,24 +218,24 @@ class Sender:
         if watermark > run.newest:
             self.spool.start_run()
             return
-        # An empty run is bound by nothing: its acknowledgement says only that the server knows no sample of it.
+        # An empty run is unbound: its acknowledgement only says that no sample is known.
         self.spool.acknowledge(place, watermark, store if watermark else run.store)
 
     def close_earlier(self) -> None:
-        """Declare that nothing more comes of the newest earlier runs."""
+        """Declare the newest earlier runs closed."""
         for _, run in [each for each in self.spool.runs() if each[0] < self.spool.place][-CLOSED_RUNS:]:
             while not (answer := self.ask(self.batch(run, run.newest + 1, [], run.newest), 3.0)) or not answer["ack"]:
                 self._pause()
             self._failures = 0
 
     def _pause(self, least_s: float = 0.0) -> None:
-        """Longer each time, and never all senders at once."""
+        """Exponential back-off with jitter."""
         pause_s = min(5.0, 0.2 * 2**self._failures) * self._draw.uniform(0.5, 1.0)
         self._failures += 1
         time.sleep(max(least_s, pause_s))
 
     def _replay(self, payload: bytes) -> None:
-        """Now and then send something again that was sent before, and do not listen to the answer."""
+        """Occasionally repeat something sent before, ignoring the answer."""
         self._sent = [*self._sent[-20:], payload]
         if self._draw.random() < 0.3:
             self.ask(self._draw.choice(self._sent), 3.0)

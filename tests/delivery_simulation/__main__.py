@@ -1,7 +1,7 @@
 """`python -m tests.delivery_simulation`: many worlds, or one that is traced.
 
---seeds N [--first F] [--real] [--json]: run so many, print each that fails with the command that replays it, and the
-sums. --seed N --trace: run one and print what happens. Exit code 1 if anything is lost, double or stuck.
+--seeds N [--first F] [--real] [--json]: run N worlds, print failures with the command that replays them, and sums.
+--seed N --trace: run one and print its events. Exit code 1 if anything is lost, double or stuck.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def main() -> int:
     parser.add_argument("--real", action="store_true", help="with the map server's own store, on files")
     parser.add_argument("--json", action="store_true", help="the last line is one JSON object")
     arguments = parser.parse_args()
-    logging.disable()  # what agents and server log of their faults
+    logging.disable()  # agents and server log their faults
     if arguments.seed is not None:
         outcome = run_one(arguments.seed, real=arguments.real, say=print if arguments.trace else None)
         print(outcome)
@@ -47,7 +47,7 @@ def main() -> int:
 
 
 def run_one(seed: int, *, real: bool = False, say: Callable[[str], None] | None = None) -> Outcome:
-    """Run one world; an error in it is a failure of this seed."""
+    """Run one world; errors are failures of the seed."""
     folder = Path(tempfile.mkdtemp(prefix="sitegrid-", dir=IN_MEMORY if IN_MEMORY.is_dir() else None))
     try:
         world = World(seed, folder, real=real, say=say)
@@ -66,9 +66,9 @@ def run_one(seed: int, *, real: bool = False, say: Callable[[str], None] | None 
 def run_seeds(
     first: int, n: int, *, real: bool = False, say: Callable[[str], None], stop_at_failure: bool = False
 ) -> dict[str, Any]:
-    """Run `n` worlds; the sums over them, and what happened in them.
+    """Run `n` worlds; returns sums and events.
 
-    Each that fails is reported with the command that replays it.
+    Failures are reported with the command that replays them.
     """
     sums: Counter[str] = Counter()
     events: Counter[str] = Counter()

@@ -1,4 +1,4 @@
-"""Bugs to plant: mistakes that somebody could make. A simulation that does not find them proves nothing."""
+"""Planted bugs, plausible mistakes; a simulation that misses them proves nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Plant = Callable[[pytest.MonkeyPatch], None]
 
 
 def ack_before_commit(patch: pytest.MonkeyPatch) -> None:
-    """The server answers first, and dies or finds its disk full then."""
+    """The server replies before it dies or its disk fills."""
 
     def commit(self: ModelServer, new: Any, answers: list[Ack | Refused], fault: Fault | None) -> list[Ack | Refused]:
         if fault is None or fault == Fault.KILLED_AFTER:
@@ -38,18 +38,18 @@ def ack_before_commit(patch: pytest.MonkeyPatch) -> None:
 
 
 def watermark_one_too_low(patch: pytest.MonkeyPatch) -> None:
-    """The server takes the last committed sample for the next that it expects."""
+    """The server takes the last committed sample for the next expected."""
     admit = servers.admit
     patch.setattr(servers, "admit", lambda batch, watermark: admit(batch, max(0, watermark - 1)))
 
 
 def watermark_one_too_high(patch: pytest.MonkeyPatch) -> None:
-    """The acknowledgement names the next sample, not the last."""
+    """The acknowledgement names the next sample instead of the last."""
     patch.setattr(Admission, "watermark", property(lambda self: self.batch.last_seq + 1))
 
 
 def delete_before_ack(patch: pytest.MonkeyPatch) -> None:
-    """The agent deletes what it has sent, not what has arrived."""
+    """The agent deletes what it sent instead of what arrived."""
     perform = uplink_thread.perform
 
     def sent_is_done(action: Action, uplink: Uplink, spool: Spool, ask: Ask) -> Action:
@@ -72,7 +72,7 @@ def _plant_admit(patch: pytest.MonkeyPatch, wrong: Callable[[SampleBatch, int], 
 
 
 def trim_whole_batch(patch: pytest.MonkeyPatch) -> None:
-    """A batch that begins with known samples is treated as known altogether, and acknowledged."""
+    """A batch that starts with known samples counts as known entirely."""
 
     def known(batch: SampleBatch, watermark: int) -> SampleBatch:
         return replace(batch, first_seq=batch.last_seq + 1, rows=batch.rows[:0])
@@ -81,12 +81,12 @@ def trim_whole_batch(patch: pytest.MonkeyPatch) -> None:
 
 
 def trim_nothing(patch: pytest.MonkeyPatch) -> None:
-    """A batch that ends with new samples is treated as new altogether."""
+    """A batch that ends with new samples counts as new entirely."""
     _plant_admit(patch, lambda batch, watermark: batch)
 
 
 def gap_is_accepted(patch: pytest.MonkeyPatch) -> None:
-    """A batch beyond the next expected sample is accepted, and what is missing is not counted."""
+    """A batch beyond the next expected sample is accepted without counting the gap."""
     admit = servers.admit
 
     def admit_gap(batch: SampleBatch, watermark: int) -> Admission:
@@ -97,7 +97,7 @@ def gap_is_accepted(patch: pytest.MonkeyPatch) -> None:
 
 
 def one_identity_for_ever(patch: pytest.MonkeyPatch) -> None:
-    """A spool keeps its spool_id when it is opened again, also as a copy of another one."""
+    """A reopened or copied spool keeps its spool_id."""
     start_run = Spool._start_run
 
     def go_on(self: Spool) -> list[SpoolRun]:
@@ -110,7 +110,7 @@ def one_identity_for_ever(patch: pytest.MonkeyPatch) -> None:
 
 
 def commit_is_assumed(patch: pytest.MonkeyPatch) -> None:
-    """The spool counts its numbers on although the disk took nothing."""
+    """The spool counts on although the disk took nothing."""
     write = Spool._write
 
     def count_first(self: Spool, rows: Any, *more: Any) -> None:
@@ -124,12 +124,12 @@ def commit_is_assumed(patch: pytest.MonkeyPatch) -> None:
 
 
 def pending_are_sent(patch: pytest.MonkeyPatch) -> None:
-    """The uplink sends what has no final value yet."""
+    """The uplink sends samples without final value."""
     patch.setattr(Spool, "_last_final", Spool._end)
 
 
 def final_values_find_others(patch: pytest.MonkeyPatch) -> None:
-    """Final values go to the newest pending samples, not to the oldest."""
+    """Final values go to the newest pending samples instead of the oldest."""
     write = Spool._write
 
     def misplace(self: Spool, rows: Any, finals: Any, oldest: int, pending: int) -> None:
@@ -139,7 +139,7 @@ def final_values_find_others(patch: pytest.MonkeyPatch) -> None:
 
 
 def final_values_are_given_up(patch: pytest.MonkeyPatch) -> None:
-    """A final value that a full disk does not take is forgotten: its sample stays pending and blocks all later ones."""
+    """A final value refused by a full disk is forgotten; its sample blocks all later ones."""
     write = WriteBuffer.write
 
     def forget(self: WriteBuffer, spool: Spool) -> int:
@@ -153,7 +153,7 @@ def final_values_are_given_up(patch: pytest.MonkeyPatch) -> None:
 
 
 def failed_commit_stays_open(patch: pytest.MonkeyPatch) -> None:
-    """A transaction whose commit fails is not rolled back."""
+    """A failed commit is not rolled back."""
 
     @contextmanager
     def careless(db: sqlite3.Connection) -> Iterator[None]:

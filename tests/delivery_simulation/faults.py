@@ -1,7 +1,4 @@
-"""The faults of a world: how likely each is, and SQLite connections that fail at a chosen statement.
-
-They fail as the disk or the process under them would.
-"""
+"""Fault rates of a world, and SQLite connections that fail at a chosen statement, like a disk or process."""
 
 from __future__ import annotations
 
@@ -19,16 +16,16 @@ from agents.delivery.spool_file import connect
 
 
 class Killed(BaseException):
-    """The process ends here: nothing of it runs on, least of all an `except Exception`."""
+    """The process ends here; not caught by `except Exception`."""
 
 
 class Fault(StrEnum):
-    """What happens at a statement."""
+    """Event at a statement."""
 
     KILLED_BEFORE = "killed_before"
     KILLED_AFTER = "killed_after"
-    FULL = "full"  # the statement fails, its transaction stays open
-    FULL_ROLLED_BACK = "full_rolled_back"  # as SQLite itself does after some errors
+    FULL = "full"  # fails, transaction stays open
+    FULL_ROLLED_BACK = "full_rolled_back"  # as SQLite does after some errors
 
 
 KILLS = (Fault.KILLED_BEFORE, Fault.KILLED_AFTER)
@@ -36,12 +33,12 @@ KILLS = (Fault.KILLED_BEFORE, Fault.KILLED_AFTER)
 
 @dataclass
 class FaultPlan:
-    """The fault that comes at the `left`-th writing statement from now, if any; and whether the process has ended."""
+    """The fault at the `left`-th writing statement from now, and whether the process ended."""
 
     fault: Fault | None = None
     left: int = 0
     killed: bool = False
-    struck: bool = False  # since it was armed
+    struck: bool = False  # since armed
 
     def arm(self, fault: Fault, left: int) -> None:
         self.fault, self.left = fault, left
@@ -63,8 +60,6 @@ class FaultPlan:
 
 
 class FaultyConnection(sqlite3.Connection):
-    """Fails by its plan."""
-
     plan: FaultPlan | None = None
 
     def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
@@ -90,7 +85,7 @@ class FaultyConnection(sqlite3.Connection):
 
 
 class FaultySpool(Spool):
-    """A spool whose process can be killed, and whose disk can be full, at any statement."""
+    """A spool whose process and disk can fail at any statement."""
 
     plan: FaultPlan
 
@@ -99,7 +94,7 @@ class FaultySpool(Spool):
         super().__init__(path, **options)
 
     def kill(self) -> None:
-        """End the process that has the file open, as it is."""
+        """Kill the process that has the file open."""
         self.plan.killed = True
         self._db.close()
         self._mark.close()
@@ -107,14 +102,14 @@ class FaultySpool(Spool):
     def _connect(self, path: Path) -> sqlite3.Connection:
         db = connect(path, FaultyConnection)
         assert isinstance(db, FaultyConnection)
-        db.execute("PRAGMA wal_autocheckpoint=0")  # files that are copied and thrown away: no need for it
+        db.execute("PRAGMA wal_autocheckpoint=0")  # the files are temporary
         db.plan = self.plan
         return db
 
 
 @dataclass(frozen=True)
 class Rates:
-    """How likely each fault is, and what kind of site this is; drawn from the seed."""
+    """Rate of each fault, and the kind of site, from the seed."""
 
     lost: float
     late: float
@@ -133,7 +128,7 @@ class Rates:
 
 
 def draw_rates(rng: random.Random) -> Rates:
-    """Every kind of fault is absent in some worlds, so that those that remain are met alone."""
+    """Every fault is absent in some worlds, so that others occur alone."""
 
     def some(most: float) -> float:
         return rng.choice((0.0, rng.uniform(0, most)))

@@ -1,4 +1,4 @@
-"""Two map servers for the simulation: a model of the journal that is fast, and the real store on files."""
+"""Two map servers for the simulation: a fast model of the journal, and the real store."""
 
 from __future__ import annotations
 
@@ -26,8 +26,6 @@ STORE = StoreIdentity("0123456789abcdef")
 
 
 class JournalledSample(NamedTuple):
-    """One sample in the journal."""
-
     machine: str
     spool_id: int
     seq: int
@@ -36,7 +34,7 @@ class JournalledSample(NamedTuple):
 
 @dataclass
 class _Disk:
-    """What is committed."""
+    """Committed data."""
 
     rows: list[Admission] = field(default_factory=list)
     marks: dict[RunKey, tuple[int, int]] = field(default_factory=dict)
@@ -46,7 +44,7 @@ class _Disk:
 
 
 class ModelServer:
-    """Admits as the map server does, and commits or forgets as its journal does; the rules of identity are its own."""
+    """Real rules of admission on a modelled journal."""
 
     def __init__(self, site: SiteConfig, now_ns: Callable[[], int]) -> None:
         self.disk = _Disk()
@@ -55,7 +53,7 @@ class ModelServer:
         self._backup = _Disk()
 
     def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
-        """Answer a group of batches in one commit; Killed if the plan says so: usable then, too."""
+        """Reply to a group of batches in one commit; Killed by plan, usable afterwards."""
         fault = plan.fault
         plan.disarm()
         new = self.disk.copy()
@@ -63,7 +61,7 @@ class ModelServer:
         return self.commit(new, answers, fault)
 
     def commit(self, new: _Disk, answers: list[Ack | Refused], fault: Fault | None) -> list[Ack | Refused]:
-        """Put the transaction on disk, and only then answer."""
+        """Commit, then reply."""
         if fault == Fault.KILLED_BEFORE:
             raise Killed
         if fault in (Fault.FULL, Fault.FULL_ROLLED_BACK):
@@ -74,22 +72,19 @@ class ModelServer:
         return answers
 
     def back_up(self) -> None:
-        """Keep a copy of all that is committed."""
         self._backup = self.disk.copy()
 
     def restore(self) -> None:
-        """Go back to the copy."""
         self.disk = self._backup.copy()
 
     def samples(self) -> Iterator[JournalledSample]:
-        """Everything in the journal."""
         for admission in self.disk.rows:
             batch = admission.batch
             for i, row in enumerate(batch.rows):
                 yield JournalledSample(batch.machine, batch.spool_id, batch.first_seq + i, row.tobytes())
 
     def marks(self) -> dict[RunKey, tuple[int, int]]:
-        """Watermark and samples declared lost, by run."""
+        """Watermark and declared losses by run."""
         return self.disk.marks
 
     def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
@@ -110,7 +105,7 @@ class ModelServer:
 
 
 class RealServer:
-    """The map server's own store, in a folder; its methods are those of the model."""
+    """The real store in a folder, with the model's methods."""
 
     def __init__(self, folder: Path, site: SiteConfig, now_ns: Callable[[], int]) -> None:
         self._folder, self._backup = folder / "store", folder / "store-backup"
@@ -121,7 +116,7 @@ class RealServer:
         self.back_up()
 
     def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
-        """As Store.commit; a killed one is started again."""
+        """Like Store.commit; restarted after a kill."""
         if plan.fault:
             self._plan.arm(plan.fault, plan.left)
         plan.disarm()
@@ -167,7 +162,7 @@ class RealServer:
         self._journal._db = db
 
     def close(self) -> None:
-        """Let go of the files without a word to SQLite: what was not committed is gone."""
+        """Drop the files without closing SQLite: uncommitted data is gone."""
         self._plan.killed = False
         self._plan.disarm()
         self._journal._db.rollback()

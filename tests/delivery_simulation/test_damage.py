@@ -1,4 +1,4 @@
-"""Logs are damaged again and again, of the server and of machines: whatever is lost was declared by its machine."""
+"""Repeated damage to logs of server and machines: all losses are declared."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RunKey = tuple[str, int]
 
 
 class Machine:
-    """A spool and its uplink. recorded: the last seq of each run."""
+    """A spool with uplink. recorded: last seq by run."""
 
     def __init__(self, name: str, folder: Path, server: RealServer) -> None:
         self.name, self.path, self.recorded = name, folder / f"{name}.db", dict[RunKey, int]()
@@ -58,7 +58,7 @@ class Machine:
 
 
 def strike(path: Path, close: Callable[[], None], start: Callable[[], None], rng: random.Random) -> None:
-    """Leave files as kill -9 does, with a bit flipped; as they were where nobody starts with that."""
+    """Leave files like kill -9 with a flipped bit; restored if nobody starts with them."""
     left = {p: p.read_bytes() for p in path.parent.glob(f"{path.name}*") if not p.name.endswith("-shm")}
 
     def put() -> None:
@@ -79,7 +79,7 @@ def strike(path: Path, close: Callable[[], None], start: Callable[[], None], rng
 
 
 def deliver_all(machines: list[Machine]) -> None:
-    """Until nothing waits; and once more, by agents that were started again."""
+    """Until nothing waits, and again by restarted agents."""
     for machine in machines * 2:
         machine.spool.close()
         machine.start()

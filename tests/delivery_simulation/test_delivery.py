@@ -1,4 +1,4 @@
-"""Delivery under faults that a seed draws; and the proof that the simulation would see a mistake."""
+"""Delivery under seeded faults; and proof that the simulation detects mistakes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_nothing_is_lost_or_double_with_the_real_store() -> None:
     assert sums["recorded"] > 500
 
 
-SHOWN_FROM = {"failed_commit_stays_open": 100, "final_values_are_given_up": 79}  # the first worlds that do
+SHOWN_FROM = {"failed_commit_stays_open": 100, "final_values_are_given_up": 79}  # first worlds that reveal it
 
 
 @pytest.mark.slow

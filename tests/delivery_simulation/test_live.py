@@ -1,4 +1,4 @@
-"""One machine's name, and a machine that catches up: over Zenoh, in one process."""
+"""Unique machine names, and a machine that catches up: over Zenoh, in one process."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ def endpoint() -> Iterator[str]:
 
 @pytest.fixture
 def slow_link(endpoint: str) -> Iterator[str]:
-    """The router's endpoint, over 300 kbit/s."""
+    """The router's endpoint over 300 kbit/s."""
     with Proxy(int(endpoint.rpartition(":")[2]), Weather(bytes_per_s=300e3 / 8), 4096) as link:
         yield link.endpoint
 
 
 @pytest.fixture
 def opened(endpoint: str) -> Iterator[Opened]:
-    """Sessions as agents have them, closed with the test."""
+    """Sessions like agents', closed with the test."""
     with contextlib.ExitStack() as stack:
 
         def session(where: str = endpoint) -> zenoh.Session:
@@ -94,7 +94,7 @@ def test_agent_without_a_router_starts(opened: Opened) -> None:
 
 
 def test_killed_predecessor_keeps_nobody_from_starting(endpoint: str, opened: Opened) -> None:
-    """Until its lease ends, a router still shows its token and hands it queries, which nobody answers."""
+    """Until its lease ends, a router shows its token and passes it queries, unanswered."""
     killed, held = opened(), []
     token = killed.liveliness().declare_token(keys.alive(SITE.name, "loader-1"))
     queryable = killed.declare_queryable(keys.alive(SITE.name, "loader-1"), held.append)
@@ -107,7 +107,7 @@ def test_killed_predecessor_keeps_nobody_from_starting(endpoint: str, opened: Op
 
 
 def test_later_one_of_two_agents_yields_until_the_other_is_gone(opened: Opened) -> None:
-    """They met only after both had started, say without a link."""
+    """They met after both had started, e.g. without a link."""
     first = Presence(opened(), SITE.name, "loader-1")
     second = Presence(opened(), SITE.name, "loader-1")
     until(lambda: second.look_around() == first.owner, "the later one sees the earlier one")
@@ -170,7 +170,7 @@ def test_uplink_ends_at_once_while_a_server_does_not_answer(opened: Opened, tmp_
 
 
 def test_forged_or_unsigned_reply_is_counted_and_not_believed(opened: Opened, tmp_path: Path) -> None:
-    """As one who controls the router's host could give it: the samples would be deleted, and nobody would have them."""
+    """An attacker on the router's host could send it: the samples would be deleted without a copy anywhere."""
     signatures = [None, b"forged"]
     store = "0123456789abcdef"
 
@@ -288,7 +288,7 @@ def test_machine_with_a_long_spool_catches_up(endpoint: str, opened: Opened, tmp
 def test_pose_and_health_stay_live_while_a_machine_catches_up(
     endpoint: str, slow_link: str, opened: Opened, tmp_path: Path
 ) -> None:
-    """Over 300 kbit/s, with more in the spool than the link can pass during the test."""
+    """Over 300 kbit/s, with a longer backlog than the test."""
     received = Counter[str]()
 
     def take(sample: zenoh.Sample) -> None:

@@ -1,8 +1,7 @@
-"""Machines, a link and a map server in one thread, with faults that a seed draws, and what must hold in the end.
+"""Machines, link and map server in one thread under seeded faults, and the final invariants.
 
-The agents are the real `Spool` and `Uplink`, with the real `perform` between them; the server is a model of the journal
-around the real rules of admission, or the real store. Time is a number. Faults stop after a while; then everything must
-be settled.
+Agents are the real `Spool` and `Uplink` with the real `perform`; the server is the real rules of admission on a
+modelled journal, or the real store. Time is a number. Faults stop eventually; then everything must settle.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ START_NS = 1_767_225_600_000_000_000
 HOUR_NS = 3_600_000_000_000
 TIMEOUT_S = UplinkConfig().timeout_s
 PACING = Pacing(first_batch=4, max_batch=16)
-MOST_ROUNDS = 3000  # to settle everything, without faults
+MOST_ROUNDS = 3000  # to settle without faults
 
 
 class SimulatedAgent:
-    """One process of a machine, its file, and what happened to it."""
+    """A machine's process, its file, and its history."""
 
     def __init__(self, name: str, machine: str, path: Path) -> None:
         self.name, self.machine, self.path = name, machine, path
@@ -51,16 +50,16 @@ class SimulatedAgent:
         self.start()
 
     def start(self) -> None:
-        """Memory of a process that has just begun, and what it may have left on its disk."""
+        """Memory of a fresh process, and what its disk may hold."""
         self.buffer = WriteBuffer()
-        self.pending: list[bytes] = []  # samples that it will make final, in their order
-        self.unwritten: dict[int, bytes] = {}  # values that may be on disk or not, by stamp
+        self.pending: list[bytes] = []  # samples it will finalise, in order
+        self.unwritten: dict[int, bytes] = {}  # values possibly on disk, by stamp
         self.before_drop: set[int] = set()
 
 
 @dataclass
 class Outcome:
-    """What became of all samples. lost, double: must be 0; explained: dropped, quarantined or gone with a disk."""
+    """Fate of all samples. lost, double: must be 0. explained: dropped, quarantined or gone with a disk."""
 
     seed: int
     recorded: int = 0
@@ -97,8 +96,8 @@ class World:
             SimulatedAgent(f"agent-{i}", f"loader-{i}", folder / f"{i}.db") for i in range(self.rates.machines)
         ]
         self._copies: dict[str, Path] = {}
-        self._contents: dict[int, bytes] = {}  # the value of every recorded sample that is to be sent, by stamp
-        self._copied: dict[int, set[bytes]] = {}  # values that a copy may send in its place
+        self._contents: dict[int, bytes] = {}  # every recorded sample's value, by stamp
+        self._copied: dict[int, set[bytes]] = {}  # values that a copy may send instead
         self._explained: set[int] = set()
         self._faults = True
         self._numbers = iter(range(10**9))
@@ -107,7 +106,7 @@ class World:
             self._start(agent)
 
     def run(self) -> Outcome:
-        """Let things happen, then let them settle, then judge."""
+        """Run events, settle, judge."""
         for _ in range(self.rates.steps):
             self._now_ns += self.rng.randint(1, 2_000_000_000)
             self._step()
@@ -144,7 +143,7 @@ class World:
         self.rng.choices(list(weights), list(weights.values()))[0](agent)
 
     def _record(self, agent: SimulatedAgent) -> None:
-        """The agent makes samples; final at once, or pending."""
+        """Record samples, final or pending."""
         if not agent.spool:
             return
         rows = [self._sample(agent) for _ in range(self.rng.randint(1, 6))]
@@ -155,7 +154,7 @@ class World:
         self._write(agent)
 
     def _finalise(self, agent: SimulatedAgent, n: int = 0) -> None:
-        """The agent learns more about the n oldest of its pending samples; 0: about some."""
+        """Finalise the n oldest pending samples; 0: some."""
         if not agent.spool or not agent.pending:
             return
         n = n or self.rng.randint(1, len(agent.pending))
@@ -167,7 +166,7 @@ class World:
         self._write(agent)
 
     def _write(self, agent: SimulatedAgent) -> None:
-        """The agent writes what it has to its disk; in vain where that is full."""
+        """Write to disk; in vain if full."""
         assert agent.spool
         before = self._present(agent) | agent.unwritten.keys()
         with self._spool_faults(agent):
@@ -175,10 +174,10 @@ class World:
             n = agent.buffer.write(agent.spool)
             self.note(f"{agent.name} wrote {n} and {len(agent.unwritten) - n} final values, {agent.spool.counters()}")
             self._is_recorded(agent)
-            self._explained |= before - self._present(agent)  # the bounded spool dropped them
+            self._explained |= before - self._present(agent)  # dropped by the bounded spool
 
     def _exchange(self, agent: SimulatedAgent) -> float:
-        """One exchange of the uplink; returns the pause that it wants [s]."""
+        """One exchange of the uplink; returns its requested pause [s]."""
         if not agent.spool or not agent.uplink:
             return 0.0
 
@@ -215,7 +214,7 @@ class World:
         return decode_reply(encode_reply(answer)), self.rng.uniform(0.0, timeout_s)
 
     def _take(self, incoming: Incoming) -> Ack | Refused | None:
-        """Hand a request to the server, in one group with late ones; None if it dies before it answers."""
+        """Pass a request to the server, grouped with late ones; None if it dies before replying."""
         group = [incoming]
         while self._late and self._faults and self.rng.random() < 0.3:
             group.insert(self.rng.randint(0, len(group)), self._late.pop(self.rng.randrange(len(self._late))))
@@ -255,9 +254,9 @@ class World:
         self.note(f"{agent.name} started with {len(present)} samples, spool_id={agent.spool.spool_id:x}")
 
     def _end_doubt(self, agent: SimulatedAgent, present: dict[int, bytes]) -> None:
-        """See whether the transaction in which a process was killed had been done; begin with an empty memory.
+        """Determine whether the transaction of a killed process was done; memory starts empty.
 
-        What the file has then is what will be sent: also of samples whose final values did not come to the disk.
+        The file's contents will be sent, even without their final values.
         """
         for stamp in agent.unwritten.keys() & present.keys():
             self._contents[stamp] = present[stamp]
@@ -274,18 +273,18 @@ class World:
             agent.spool, agent.uplink = None, None
 
     def _copy_or_restore(self, agent: SimulatedAgent) -> None:
-        """Keep a copy of the spool; put it back later; or start a second process of the machine from it."""
+        """Copy the spool; restore it later; or start a second process from it."""
         if not self.rates.copies:
             return
         copy = self._copies.get(agent.machine)
         if copy is None:
             copy = self._copy(agent.path, self._folder / f"copy-{next(self._numbers)}.db")
             self._copies[agent.machine] = copy
-            for stamp, row in self._rows(copy).items():  # of a pending sample the copy never learns the final value
+            for stamp, row in self._rows(copy).items():  # the copy never learns pending final values
                 self._copied.setdefault(stamp, set()).add(row)
             self.note(f"{agent.name} copied")
         elif self.rng.random() < 0.5:
-            # Gone with the disk that is thrown away; what was quarantined there is declared lost, the copy's too.
+            # Gone with the discarded disk; quarantined samples are declared lost, the copy's too.
             self._explained |= self._held(agent.path) - self._held(copy) | self._quarantined(agent.path)
             self._end(agent, orderly=False)
             self._end_doubt(agent, self._rows(agent.path))
@@ -305,7 +304,7 @@ class World:
         self.note(f"{agent.name} clock off by {agent.clock_ns / HOUR_NS:+.0f} h")
 
     def _change_server(self, *_: object) -> None:
-        """Switch it on or off, back it up, or restore it."""
+        """Toggle, back up or restore the server."""
         draw = self.rng.random()
         if draw < 0.6 or not self.rates.server_backups:
             self._server_up = not self._server_up
@@ -324,7 +323,7 @@ class World:
     # --- the end -----------------------------------------------------------------------------------------------------
 
     def _settle(self) -> None:
-        """No more faults: everything that was recorded arrives."""
+        """Without faults everything recorded arrives."""
         self.note("--- faults stop ---")
         self._faults, self._server_up = False, True
         self._now_ns += 2 * HOUR_NS
@@ -335,7 +334,7 @@ class World:
             self._finalise(agent, len(agent.pending))
             self._write(agent)
         self._deliver_all()
-        for agent in self._agents:  # the next start declares what was quarantined or dropped at the end of a run
+        for agent in self._agents:  # the next start declares samples quarantined or dropped at a run's end
             self._end(agent, orderly=True)
             self._start(agent)
         self._deliver_all()
@@ -370,14 +369,14 @@ class World:
         self._judge_counters()
 
     def _judge_marks(self, runs: list[tuple[str, int]]) -> None:
-        """Of every run: what is there and what was declared lost make up the watermark."""
+        """Per run, present and declared lost samples make up the watermark."""
         present = Counter(runs)
         for run, (seq, lost) in self._server.marks().items():
             if present[run] + lost != seq:
                 self.outcome.problems.append(f"run {run[1]:x}: {present[run]} there + {lost} lost is not {seq}")
 
     def _judge_counters(self) -> None:
-        """Where no file was copied or thrown away, the agents have counted all that never arrived."""
+        """Unless files were copied or discarded, agents counted all missing samples."""
         events = self.outcome.events
         if events["spool_restores"] or events["clones"] or events["server_restores"]:
             return
@@ -393,7 +392,7 @@ class World:
 
     @contextlib.contextmanager
     def _spool_faults(self, agent: SimulatedAgent):
-        """Perhaps a fault at one of the next statements of an agent's file."""
+        """Possible fault at a coming statement of an agent's file."""
         if self._happens(self.rates.spool_fault):
             agent.plan.arm(self.rng.choice(list(Fault)), self.rng.randint(1, 9))
         try:
@@ -441,18 +440,18 @@ class World:
         return set(self._rows(path))
 
     def _rows(self, path: Path, table: str = "sample") -> dict[int, bytes]:
-        """Read a file, whoever has it open: a copy of it. Rows by stamp."""
+        """Rows by stamp, from a copy of a file that may be open."""
         with contextlib.closing(sqlite3.connect(self._copy(path, self._folder / "look.db"))) as db:
             try:
                 return {_stamp(row): row for (row,) in db.execute(f"SELECT row FROM {table}")}
-            except sqlite3.OperationalError:  # the process was killed while it made the file
+            except sqlite3.OperationalError:  # killed while creating the file
                 return {}
 
     def _quarantined(self, path: Path) -> set[int]:
         return set(self._rows(path, "quarantine"))
 
     def _copy(self, source: Path, target: Path) -> Path:
-        """Copy a database between two transactions, with its log."""
+        """Copy a database with its log, between transactions."""
         for suffix in ("", "-wal"):
             other = Path(f"{target}{suffix}")
             other.unlink(missing_ok=True)

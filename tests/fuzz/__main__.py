@@ -1,10 +1,9 @@
-"""`python -m tests.fuzz --seconds 60`: fuzz all decoders, or one, and print what became of the inputs.
+"""`python -m tests.fuzz --seconds 60`: fuzz all decoders, or one, and print the fate of the inputs.
 
---decoder NAME: only this one. --seed N: other inputs. Failing inputs are saved beside the tests, in corpus/. Exit
-code 1 if there are any.
+--decoder NAME: only this one. --seed N: other inputs. Failing inputs are saved as corpus/<decoder>/<hash>. Exit code 1
+if there are any.
 
-Inputs that once failed are replayed, then new ones are made until the time is up. corpus/<decoder>/<hash>: one small
-file for each fault that was found.
+Known failing inputs are replayed, then new ones are made until the time is up.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from tests.fuzz.verdict import Decoder, FaultError, judge, watched
 
 CORPUS = Path(__file__).parent / "corpus"
 MAX_FILE_BYTES = 16 * 2**10
-ROUND = 200  # inputs between two looks at the clock
-SHRINK = 400  # inputs that are tried to make a failing one shorter
+ROUND = 200  # inputs between looks at the clock
+SHRINK = 400  # attempts to shorten a failing input
 LINE = "{:<14} {:>9} {:>9} {:>9} {:>7}"
 
 
 @dataclass
 class DecoderResult:
-    """What became of the inputs of one decoder. faults: by signature, what happened and the shortest such input."""
+    """Results of one decoder. faults: by signature, description and shortest input."""
 
     decoder: str
     accepted: int = 0
@@ -40,7 +39,7 @@ class DecoderResult:
     faults: dict[str, tuple[str, bytes]] = field(default_factory=dict)
 
     def take(self, decoder: Decoder, data: bytes) -> str | None:
-        """Judge one input; the signature of its fault, if it has one."""
+        """Judge one input; returns its fault's signature, if any."""
         try:
             if judge(decoder, data):
                 self.accepted += 1
@@ -55,7 +54,7 @@ class DecoderResult:
 
 
 def replay(decoder: Decoder) -> DecoderResult:
-    """Seeds, which have to be accepted, and the corpus, which has to be free of faults by now."""
+    """Seeds must be accepted, and the corpus be free of faults."""
     result = DecoderResult(decoder.name)
     for data in decoder.seeds:
         result.take(decoder, data)
@@ -67,10 +66,7 @@ def replay(decoder: Decoder) -> DecoderResult:
 
 
 def fuzz(decoder: Decoder, result: DecoderResult, n: int, number: int) -> None:
-    """Judge about `n` new inputs, drawn from the seed `number`; stops at the first fault that is not in `result` yet.
-
-    The input is made shorter then.
-    """
+    """Judge about `n` inputs from the seed `number`; stops at the first new fault, and shortens its input."""
     known, first, tries = set(result.faults), "", 0
 
     @seed(number)
@@ -95,12 +91,12 @@ def fuzz(decoder: Decoder, result: DecoderResult, n: int, number: int) -> None:
 
     try:
         one()
-    except (FaultError, HypothesisException):  # also where shrinking was cut short, which Hypothesis calls flaky
+    except (FaultError, HypothesisException):  # interrupted shrinking counts as flaky for Hypothesis
         assert first, "Hypothesis failed by itself"
 
 
 def fuzz_for(decoder: Decoder, seconds: float, number: int) -> DecoderResult:
-    """Replay, then round after round until the time is up."""
+    """Replay, then fuzz until the time is up."""
     result, end_s, rounds = replay(decoder), time.monotonic() + seconds, 0
     while time.monotonic() < end_s:
         fuzz(decoder, result, ROUND, 1_000_003 * number + rounds)
@@ -109,7 +105,7 @@ def fuzz_for(decoder: Decoder, seconds: float, number: int) -> DecoderResult:
 
 
 def save(result: DecoderResult) -> list[Path]:
-    """Add what failed to the corpus; returns the new files."""
+    """Add failures to the corpus; returns new files."""
     saved = []
     for _, data in result.faults.values():
         path = CORPUS / result.decoder / hashlib.sha256(data).hexdigest()[:12]
@@ -126,7 +122,7 @@ def main() -> int:
     parser.add_argument("--decoder", help="only this one")
     parser.add_argument("--seed", type=int, default=0, help="other inputs")
     arguments = parser.parse_args()
-    logging.disable()  # what decoders log of bad files
+    logging.disable()  # decoders log bad files
     chosen = [one for one in decoders() if arguments.decoder in (None, one.name)]
     if not chosen:
         parser.error(f"no decoder {arguments.decoder!r}; there are {', '.join(one.name for one in decoders())}")

@@ -1,7 +1,7 @@
-"""`python -m tests.fuzz.can_frames --cases 1000000`: frames of a bus with anything in them.
+"""`python -m tests.fuzz.can_frames --cases 1000000`: arbitrary CAN frames.
 
-Identifiers of known groups from any sender, of others, of 11 bits; any bytes, cut, with the values that mean errors.
-Nothing may raise, each value is one that its reading takes, and a whole frame behind each tenth is read.
+Identifiers of known groups from any sender, of other groups, with 11 bits; any bytes, cut, with error values. Nothing
+may raise, every value must suit its reading, and a valid frame after every tenth is read.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ OWN = {
 
 @dataclass
 class Outcome:
-    """What became of the frames. refused: values that no reading takes. lost: whole frames that were not read."""
+    """Fate of the frames. refused: values unsuited for readings. lost: valid frames not read."""
 
     cases: int
     values: int
@@ -58,7 +58,6 @@ def frame(draw: random.Random) -> tuple[int, bytes, bool]:
 
 
 def run(cases: int, seed: int = 0) -> Outcome:
-    """Take so many frames."""
     draw = random.Random(f"can {seed}")
     feeds = {name: SensorConfig(name, s.kind, std=STD.get(s.kind, {})) for name, s in STREAMS.items()}
     feeds |= {"0x77:engine": SensorConfig("whole", "engine")}

@@ -1,7 +1,4 @@
-"""Every decoder of the project, with valid inputs to start from and the law that an accepted input has to keep.
-
-The law is that what was read can be written and read again, and is the same then.
-"""
+"""All decoders with valid inputs, and the law of accepted inputs: written and reread they are equal."""
 
 from __future__ import annotations
 
@@ -66,7 +63,7 @@ PLAIN = ("health", "info", "machines", "machine", "changes", "change", "calibrat
 
 @cache
 def workshop() -> Path:
-    """A folder for files that are read by name; it goes with the process."""
+    """A folder for files read by name, for the process's lifetime."""
     folder = tempfile.TemporaryDirectory(prefix="sitegrid-fuzz-")
     _KEPT.append(folder)
     return Path(folder.name)
@@ -121,7 +118,7 @@ def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], 
     if name == "region":
         assert isinstance(value.bounds, Bounds)
     if name == "pose":
-        with suppress(MessageError):  # what every pose is put through behind its codec
+        with suppress(MessageError):  # checks of every pose after its codec
             heard = receive_pose(pose("paper", "loader-1"), data)
             assert heard.machine == "loader-1"
             assert max(abs(heard.x_m), abs(heard.y_m)) <= MAX_EXTENT_M
@@ -129,7 +126,7 @@ def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], 
         assert str(value).isprintable()
     if name == "reply":
         assert getattr(value, "problem", "").isprintable()
-        with suppress(MessageError):  # of an offer alone: the acknowledgement holds
+        with suppress(MessageError):  # for an offer only: the acknowledgement is valid
             offer = decode_offer(getattr(value, "offer", None))
             assert decode_offer(encode_offer(offer)) == offer
     if name in PLAIN:
@@ -205,7 +202,7 @@ def _text_of(sealed_text: str) -> str:
 
 
 def _sealed(load: Callable[[Path], object]) -> Callable[[Path], object]:
-    """Load a text behind a checksum that is right: else nothing but that would be tried."""
+    """Add a valid checksum, else nothing behind it would be tested."""
 
     def seal_and_load(path: Path) -> None:
         with suppress(UnicodeDecodeError):
@@ -288,7 +285,7 @@ def _log(folder: Path, file: str, data: bytes) -> None:
 
 
 def _truth(folder: Path, file: str, data: bytes) -> None:
-    """Of a log, described beside it and read."""
+    """A log's truth, described and read."""
     (folder / file).write_bytes(data)
     log = open_log(folder)
     assert all(area.c_rr is not None or area.has_gradient for area in read_known_ground(log, folder))
@@ -317,7 +314,7 @@ def _kept() -> Iterator[Decoder]:
 
 
 def _journal(folder: Path) -> Decoder:
-    """A row whose record is another one."""
+    """A row with another record."""
     expected = _write_journal(folder)
     path = folder / "journal.db"
     db = sqlite3.connect(path, isolation_level=None)
@@ -333,7 +330,7 @@ def _journal(folder: Path) -> Decoder:
 
 
 def _archive(folder: Path) -> Iterator[Decoder]:
-    """A file that is damaged anywhere, and one that a stranger has sealed."""
+    """A file damaged anywhere, and one sealed by a stranger."""
     expected = _write_journal(folder)
     with SqliteReader(folder / "journal.db") as reader:
         made = next_file(folder / ARCHIVE, reader, SITE, T0 + 360_000 * 10**9)
@@ -349,7 +346,7 @@ def _archive(folder: Path) -> Iterator[Decoder]:
     def decode_strange(data: bytes) -> None:
         with strange.open("w+b") as file:
             file.write(data)
-            with suppress(OSError):  # of what states no footer, that is none
+            with suppress(OSError):  # files without footer
                 seal(file)
         for row in ArchiveFile(strange).read():
             check_samples(row.rows, MAX_EXTENT_M)
@@ -363,7 +360,7 @@ def _archive(folder: Path) -> Iterator[Decoder]:
 
 
 def _write_journal(folder: Path) -> list[JournalRow]:
-    """Make a journal of three rows; returns what has to be read from it."""
+    """Make a journal of three rows; returns the expected content."""
     journal = SqliteJournal(folder / "journal.db", SITE.name, SITE.frame)
     journal.begin()
     for i in range(3):

@@ -1,7 +1,7 @@
-"""`python -m tests.fuzz.frames --cases 1000000`: broken frames of receivers, by the hundred thousand.
+"""`python -m tests.fuzz.frames --cases 1000000`: broken receiver frames.
 
-Frames are flipped, cut and overwritten; or their fields are hostile and their checksum is right. Nothing may raise, and
-each whole frame among them is read. `--format`: one of `nmea`, `ubx`, `gpsd`; without it all three.
+Frames are flipped, cut and overwritten, or have hostile fields with valid checksums. Nothing may raise, and every valid
+frame among them is read. `--format`: one of `nmea`, `ubx`, `gpsd`; default all.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ NAMES = ("mode", "time", "lat", "lon", "altHAE", "alt", "speed", "track", "statu
 
 
 def nmea(draw: random.Random) -> bytes:
-    """A sentence whose fields may be anything."""
+    """A sentence with arbitrary fields."""
     words = draw.choice(SENTENCES).split(",")
     for _ in range(draw.randrange(4)):
         words[draw.randrange(len(words))] = draw.choice(WORDS)
@@ -70,10 +70,10 @@ def nmea(draw: random.Random) -> bytes:
 
 
 def ubx(draw: random.Random) -> bytes:
-    """A frame whose payload may be anything."""
+    """A frame with an arbitrary payload."""
     kind, identity, size = draw.choice(FRAMES)
     payload = bytearray(draw.randbytes(size + draw.choice((0, 0, 0, -1, 4, -size))))
-    if size == 92 and len(payload) == 92 and draw.random() < 0.5:  # so that more than its date is looked at
+    if size == 92 and len(payload) == 92 and draw.random() < 0.5:  # reaches code beyond the date
         payload[4:12] = (2026).to_bytes(2, "little") + bytes((11, 26, 10, 15, draw.randrange(62), 7))
         payload[16:22] = bytes(4) + bytes((3, 1))
     body = bytes((kind, identity)) + len(payload).to_bytes(2, "little") + payload
@@ -85,7 +85,7 @@ def ubx(draw: random.Random) -> bytes:
 
 
 def gpsd(draw: random.Random) -> bytes:
-    """A report whose values may be anything."""
+    """A report with arbitrary values."""
     report: dict[str, object] = {"class": draw.choice(("TPV", "TPV", "SKY", 5, None, []))}
     report |= {"mode": 3, "time": "2026-11-26T10:15:27.200Z", "lat": 49.0, "lon": 8.4}
     report |= {draw.choice(NAMES): draw.choice(VALUES) for _ in range(draw.randrange(4))}
@@ -102,7 +102,7 @@ WHOLE = {
 
 @dataclass
 class Outcome:
-    """What became of the frames of one format. lost: whole ones that were not read."""
+    """Fate of one format's frames. lost: valid ones not read."""
 
     format: str
     cases: int
@@ -114,7 +114,7 @@ class Outcome:
 
 
 def spoil(draw: random.Random, data: bytes) -> bytes:
-    """Flip, cut, overwrite, or leave as it is."""
+    """Flip, cut, overwrite, or keep."""
     at = draw.randrange(len(data))
     match draw.randrange(5):
         case 0:
@@ -129,7 +129,7 @@ def spoil(draw: random.Random, data: bytes) -> bytes:
 
 
 def run(format_: str, cases: int, seed: int = 0) -> Outcome:
-    """Feed so many frames in pieces of any size, a whole one behind each tenth."""
+    """Feed frames in pieces of any size, a valid one after every tenth."""
     draw, line, framer = random.Random(f"{format_} {seed}"), Line(format_, FEEDS), Framer(FRAMINGS)
     whole, stream, sent, read, used_s = WHOLE[format_], bytearray(), 0, 0, 0.0
     for i in range(cases):

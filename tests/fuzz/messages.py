@@ -1,7 +1,7 @@
-"""Valid MessagePack messages, edited where it hurts: fields dropped, retyped, nested, doubled, columns cut and swapped.
+"""Valid MessagePack messages with hostile edits: fields dropped, retyped, nested, doubled; columns cut and swapped.
 
-A message is taken apart into a tree whose maps are lists of pairs, so that a key can stand twice; a leaf that is `Raw`
-is bytes as they are, so that a header can claim what is not there.
+Messages become trees whose maps are lists of pairs, to allow duplicate keys; `Raw` leaves are verbatim bytes, so
+headers can lie.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class MapNode(list[list[Any]]):
 
 
 class Raw(bytes):
-    """Bytes that stand in the message as they are."""
+    """Verbatim bytes."""
 
 
 _CLAIM = b"\xff\xff\xff\xff"
@@ -33,11 +33,11 @@ NASTY: tuple[Any, ...] = (
     *(Raw(b"\x91" * depth + b"\x01") for depth in (20, 600, 2000)),
     *(Raw(b"\x81\xa1v" * depth + b"\x01") for depth in (20, 600)),
     *(Raw(header + _CLAIM) for header in (b"\xdd", b"\xdf", b"\xc6", b"\xdb", b"\xc9")),
-    Raw(b"\xdd\x00\x01\x86\xa0" * 1000),  # a thousand lists in each other, each said to have 100,000 items
+    Raw(b"\xdd\x00\x01\x86\xa0" * 1000),  # a thousand nested lists, each claiming 100,000 items
     Raw(b"\xdc\xff\xff"),
-    Raw(b"\xd6\xff\xff\xff\xff\xff"),  # an instant, which is no plain value
-    Raw(b"\xd4\x05\x00"),  # a type of its own
-    Raw(b"\xa2\xff\xfe"),  # no UTF-8
+    Raw(b"\xd6\xff\xff\xff\xff\xff"),  # a timestamp, no plain value
+    Raw(b"\xd4\x05\x00"),  # an extension type
+    Raw(b"\xa2\xff\xfe"),  # invalid UTF-8
     Raw(b"\xc1"),  # reserved
 )
 _KEYS: tuple[Any, ...] = ("v", "n", "cols", "zzz", "", "a\nb", "k" * 5000, b"n", 1, None, Raw(b"\x90"))
@@ -51,7 +51,7 @@ _ELEMENTS = {
 
 
 def messages(seeds: Sequence[bytes]) -> SearchStrategy[bytes]:
-    """Edited copies of these messages; some of them are damaged as bytes, too."""
+    """Edited copies of messages, some damaged as bytes too."""
 
     @st.composite
     def strategy(draw: DrawFn) -> bytes:
@@ -65,7 +65,7 @@ def messages(seeds: Sequence[bytes]) -> SearchStrategy[bytes]:
 
 
 def pack_tree(node: Any) -> bytes:
-    """A tree as bytes; what was edited to lie outside of MessagePack stays outside."""
+    """A tree as bytes, even outside of MessagePack."""
     if isinstance(node, Raw):
         return bytes(node)
     if isinstance(node, MapNode):
@@ -87,7 +87,7 @@ def _tree(value: Any) -> Any:
 
 
 def _places(node: Any) -> list[tuple[list[Any], int]]:
-    """Every value of a tree, as the list that holds it and the place there."""
+    """Every value of a tree, as its list and index."""
     places: list[tuple[list[Any], int]] = []
     if isinstance(node, list) and not isinstance(node, MapNode):
         places += [(node, i) for i in range(len(node))]
@@ -104,7 +104,7 @@ def _maps(node: Any) -> list[MapNode]:
 
 
 def _edit(draw: DrawFn, root: list[Any]) -> None:
-    """Change one thing of a tree, in place."""
+    """Change one thing of a tree in place."""
     maps = [each for each in _maps(root) if each]
     if maps and draw(st.booleans()):
         _edit_map(draw, draw(st.sampled_from(maps)))
@@ -133,7 +133,7 @@ def _edit_map(draw: DrawFn, table: MapNode) -> None:
 
 
 def _column(draw: DrawFn, data: bytes) -> bytes:
-    """A column that is cut, too long, in the other order of bytes, or has one impossible number."""
+    """A column that is cut, too long, byte-swapped, or has one impossible number."""
     width = draw(st.sampled_from((4, 8)))
     what = draw(st.sampled_from(("cut", "longer", "swapped", "number")))
     if what == "cut":

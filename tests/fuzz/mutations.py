@@ -1,4 +1,4 @@
-"""Files whose bytes are damaged: bits flipped, cut, doubled, overwritten; texts that are edited by line and by word."""
+"""Damaged files: bits flipped, cut, doubled, overwritten; texts edited by line and word."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def damaged(draw: DrawFn, data: bytes) -> bytes:
 
 
 def files(seeds: Sequence[bytes]) -> SearchStrategy[bytes]:
-    """Damaged copies of these files."""
+    """Damaged copies of files."""
 
     @st.composite
     def strategy(draw: DrawFn) -> bytes:
@@ -63,7 +63,7 @@ def files(seeds: Sequence[bytes]) -> SearchStrategy[bytes]:
 
 
 def texts(seeds: Sequence[bytes]) -> SearchStrategy[bytes]:
-    """Edited copies of these UTF-8 texts; some of them are damaged as bytes, too."""
+    """Edited copies of UTF-8 texts, some damaged as bytes too."""
 
     @st.composite
     def strategy(draw: DrawFn) -> bytes:
@@ -98,7 +98,7 @@ def _with_value(draw: DrawFn, text: str) -> str:
 
 
 def _with_word(draw: DrawFn, text: str) -> str:
-    """Replace, drop or double one word or sign."""
+    """Replace, drop or double a word or sign."""
     words = _WORD.findall(text)
     if not words:
         return draw(st.sampled_from(_PLAIN))
@@ -110,7 +110,7 @@ def _with_word(draw: DrawFn, text: str) -> str:
 
 
 def _with_line(draw: DrawFn, text: str) -> str:
-    """Drop, double or move one line."""
+    """Drop, double or move a line."""
     lines = text.split("\n")
     at = draw(st.integers(0, len(lines) - 1))
     line = lines.pop(at)

@@ -1,4 +1,4 @@
-"""What strangers send and bring: bytes of a connection to the web server, and archives whose seal is right."""
+"""Input from strangers: connections to the web server, and archives with valid seals."""
 
 from __future__ import annotations
 
@@ -41,20 +41,20 @@ SAID = (
     b"\x89\x81\0\0\0\0p\x88\x82\0\0\0\0\x03\xe8",
     b"\x01\x81\0\0\0\0{\x80\x81\0\0\0\0}",
 )
-OWN = (500, 501, 505)  # statuses that say that the server did something wrong
+OWN = (500, 501, 505)  # statuses that blame the server
 TURNS = 200  # of the event loop, for an answer
 ODD = (0, -1, 1, 2**31, 2**62, 1e300, -1e300, np.nan, np.inf, 1e-320)
 
 
 def web() -> Iterator[Decoder]:
-    """Decoders of whole connections. The map server does not answer, but for the state of the map."""
+    """Decoders of whole connections; the map server only answers `info`."""
     paths = (*ASKED, *(f"{PREFIX}/sites/{SITE}/{name}?{PARAMETERS}" for name in RESOURCES))
     yield Decoder("http", tuple(f"GET {path}{HEAD}".encode() for path in paths), partial(_connect, b""), (), texts)
     yield Decoder("frames", SAID, partial(_connect, LIVE.encode()), (), files)
 
 
 class _NoServer:
-    """A client whose map server only says how its map is."""
+    """A client whose map server only answers `info`."""
 
     site = SITE
 
@@ -68,7 +68,7 @@ class _NoServer:
 
 
 class _Wire(asyncio.Transport):
-    """The other end of a connection. sent: all that was answered."""
+    """The peer of a connection. sent: all answers."""
 
     def __init__(self) -> None:
         super().__init__({"peername": ("127.0.0.1", 1), "sockname": ("127.0.0.1", 2)})
@@ -105,7 +105,7 @@ def _server() -> tuple[asyncio.AbstractEventLoop, Config]:
 
 
 def _connect(begin: bytes, data: bytes) -> None:
-    """Have a connection say this; AssertionError where the server calls anything its own fault."""
+    """Send this on a connection; AssertionError if the server blames itself."""
     loop, config = _server()
     wire, wrong = _Wire(), list[Any]()
     loop.set_exception_handler(lambda _, context: wrong.append(context))
@@ -134,7 +134,7 @@ async def _say(wire: _Wire, config: Config, parts: tuple[bytes, ...]) -> None:
 
 
 def archives(seeds: tuple[bytes, ...]) -> SearchStrategy[bytes]:
-    """Parquet files with other values, types, names or orders of rows and columns; some of them are damaged, too."""
+    """Parquet files with other values, types, names or orders, some damaged too."""
 
     @st.composite
     def strategy(draw: DrawFn) -> bytes:

@@ -1,4 +1,4 @@
-"""A short, repeatable form of `python -m tests.fuzz`: the corpus, then a few inputs for each decoder."""
+"""A short, repeatable `python -m tests.fuzz`: the corpus, then a few inputs per decoder."""
 
 from __future__ import annotations
 

@@ -1,5 +1,3 @@
-"""A short form of `python -m tests.fuzz.frames`."""
-
 from __future__ import annotations
 
 import pytest

@@ -1,7 +1,6 @@
-"""What a decoder may do with an input: give a correct value, or its documented error in one line that names the place.
+"""Law of decoders: a correct value, or a documented one-line error that names the place.
 
-Never another error, never a warning, never more than CPU_S of processor time, never more memory than the input is
-worth.
+No other error, no warning, at most CPU_S of CPU time, memory bounded by the input's size.
 """
 
 from __future__ import annotations
@@ -19,19 +18,19 @@ from hypothesis.strategies import SearchStrategy
 
 from protocol.errors import MessageError, QueryError, Refusal, one_line
 
-CPU_S = 10.0  # no input of these sizes takes a tenth of a second: it stops a hang
-MEMORY_BYTES = 24 * 2**20  # that any input may cost, and
-MEMORY_PER_BYTE = 100  # for each of its bytes: 1 B of MessagePack is an object of 32 B in a list of 8 B
+CPU_S = 10.0  # stops hangs: no such input takes a tenth of a second
+MEMORY_BYTES = 24 * 2**20  # allowed for any input, and
+MEMORY_PER_BYTE = 100  # per byte of it: 1 B of MessagePack can be an object of 32 B in a list of 8 B
 LINE_CHARACTERS = 500
-WHOLE = (Refusal.NOT_MSGPACK, Refusal.TOO_LARGE)  # said of a message as a whole
+WHOLE = (Refusal.NOT_MSGPACK, Refusal.TOO_LARGE)  # refer to a whole message
 
 
 @dataclass(frozen=True)
 class Decoder:
     """One decoder under test.
 
-    decode: raises AssertionError where the value that it returns is not a correct one. errors: what it may raise.
-    place: what a message of these errors names, besides the field of a MessageError. inputs: makes inputs from seeds.
+    decode: AssertionError for an incorrect value. errors: permitted ones. place: named by these errors' messages,
+    besides a MessageError's field. inputs: from seeds.
     """
 
     name: str
@@ -43,7 +42,7 @@ class Decoder:
 
 
 class FaultError(Exception):
-    """A decoder did what it may not. signature: tells one fault from another."""
+    """A decoder broke the law. signature: identifies the fault."""
 
     def __init__(self, signature: str, problem: str) -> None:
         super().__init__(f"{signature}: {problem[:300]}")
@@ -51,11 +50,11 @@ class FaultError(Exception):
 
 
 class _OutOfTime(BaseException):
-    """Raised by the timer, in whatever runs; no `except Exception` swallows it."""
+    """Raised by the timer; not caught by `except Exception`."""
 
 
 def judge(decoder: Decoder, data: bytes) -> bool:
-    """Whether the decoder accepts the input; a fault where it neither accepts nor properly refuses it."""
+    """Whether the input is accepted; FaultError unless accepted or properly refused."""
     try:
         with _bounded(len(data)):
             decoder.decode(data)
@@ -74,7 +73,7 @@ def judge(decoder: Decoder, data: bytes) -> bool:
 
 @contextmanager
 def watched() -> Iterator[None]:
-    """Have warnings count as faults, and memory and processor time measured, for as long as inputs are judged."""
+    """Measure memory and CPU time during the block; warnings are faults."""
 
     def on_alarm(number: int, frame: FrameType | None) -> None:
         raise _OutOfTime

@@ -1,6 +1,6 @@
 """Write the golden messages beside this file: `PYTHONPATH=. python tests/golden/make.py`.
 
-Only after a deliberate change of the wire, with docs/protocol.md. The tests compare files and records both ways.
+Only after a deliberate change of the wire and docs/protocol.md. Tests compare files and records both ways.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Golden:
-    """One message: the record, and the two functions that must agree on its bytes."""
+    """One message: record, encoder, decoder."""
 
     record: Any
     encode: Callable[[Any], bytes]
@@ -66,7 +66,7 @@ class Golden:
 
 
 def rows() -> np.ndarray:
-    """Return four samples: complete, without a gradient, without a resistance, and with neither."""
+    """Four samples: complete, without gradient, without resistance, without both."""
     whole = (T0, 12.25, -40.5, 1.5, 0.25, 2.0, 0.5, 2.75, 0.55, 0.02, 1e-5, 0.125, -0.25, 1e-4)
     level = (T0 + 200_000_000, 12.75, -40.25, 1.5, -0.25, 2.0, 0.5, -2.75, 0.5, 0.25, 1e-5, NAN, NAN, NAN)
     ahead = (T0 + 400_000_000, 13.25, -40.0, 0.0, 0.0, 0.0, -3.0, 0.0, 0.0, NAN, NAN, 0.0, 0.0, 1e-4)
@@ -84,20 +84,20 @@ def rows() -> np.ndarray:
 
 
 def aided(rows: np.ndarray) -> np.ndarray:
-    """Return the samples of a machine that found its place on lanes."""
+    """The samples of a machine localised on lanes."""
     rows["aid_share"] = 0.0, 0.25, 0.5, 1.0
     return rows
 
 
 def fuelled() -> np.ndarray:
-    """Return the same samples of a machine that says what it burns, but once."""
+    """The samples of a machine that states its fuel, once not."""
     out = rows()
     out["fuel_l"] = 0.0078125, 0.0, NAN, 0.25
     return out
 
 
 def readings() -> tuple[Any, ...]:
-    """One reading of each kind, and a second of one of them."""
+    """A reading of each kind, and one more."""
     return (
         Gps("gps-1", T0, 49.5, 8.25, 112.5, 1.5, 1.5, 4.0),
         Imu("imu-1", T0 + 1, 0.001, -0.002, 0.25, 0.1, -0.2, 9.80665),
@@ -111,7 +111,7 @@ def readings() -> tuple[Any, ...]:
 
 
 def region() -> records.Region:
-    """3 x 2 cells of half a metre, south-west corner (-1, 2)."""
+    """3 x 2 cells of 0.5 m, south-west corner (-1, 2)."""
     resistance = np.array([[0.02, NAN, 0.25], [NAN, 0.008, 0.04]], np.float32)
     return records.Region(
         x_m=np.array([-0.75, -0.25, 0.25]),
@@ -124,23 +124,23 @@ def region() -> records.Region:
 
 
 def points() -> records.PointsAnswer:
-    """Three places, one of them unknown."""
+    """Three places, one unknown."""
     layers = {"resistance": np.array([0.02, NAN, 0.25], np.float32), "visits": np.arange(3, dtype=np.float32)}
     return records.PointsAnswer(np.array([0.5, 1.5, -3.5]), np.array([2.5, 2.5, 0.5]), layers, VERSION, T0)
 
 
 def piece() -> records.Region:
-    """The region as the second of two pieces, two columns to the east."""
+    """The region as the second of two pieces, two columns eastward."""
     return replace(region(), piece=records.Piece(123_456_789, 1, 2, 2, 0, 5, 2))
 
 
 def decode_batch(data: bytes) -> SampleBatch:
-    """Decode with the extent of the golden site."""
+    """Decode with the golden site's extent."""
     return codec.decode_batch(data, EXTENT_M)
 
 
 def decode_info_table(data: bytes) -> dict[str, Any]:
-    """Decode any table of plain values; `decode_info` asks for every field of `MapInfo`."""
+    """Decode plain values; `decode_info` requires all fields of `MapInfo`."""
     return take_plain(unpack(data, MAX_SMALL_BYTES), "info")
 
 
@@ -338,19 +338,19 @@ GOLDEN: dict[str, Golden] = {
     "error.bin": Golden(ERROR, answers.encode_error, answers.decode_error),
     "overloaded.bin": Golden(OVERLOADED, answers.encode_error, answers.decode_error),
 }
-OLDER = "batch_older.bin"  # of an agent that does not calibrate itself: it states nothing
-NEWER = "batch_newer.bin"  # of a later version of the software: an unknown field and an unknown column
+OLDER = "batch_older.bin"  # of an agent without own calibration
+NEWER = "batch_newer.bin"  # of later software: an unknown field and an unknown column
 
 
 def older_batch() -> bytes:
-    """Return BATCH as an agent without a calibration sends it."""
+    """BATCH from an agent without own calibration."""
     table = msgpack.unpackb(codec.encode_batch(BATCH))
     cols = {name: column for name, column in table["cols"].items() if name not in OPTIONAL}
     return bytes(msgpack.packb({**table, "cols": cols}))
 
 
 def newer_batch() -> bytes:
-    """Return BATCH as a newer agent might send it."""
+    """BATCH from a newer agent."""
     table = msgpack.unpackb(codec.encode_batch(BATCH))
     table["cols"]["slip"] = np.zeros(len(BATCH.rows), "<f4").tobytes()
     return bytes(msgpack.packb({**table, "firmware": "2.0"}))

@@ -1,6 +1,6 @@
-"""Every question and command with every option once, whose selectors stand in `selectors.txt` beside this file.
+"""Every query and command with every option, for the selectors in `selectors.txt`.
 
-`PYTHONPATH=. python tests/golden/questions.py` writes them; only after a deliberate change of the wire, with
+`PYTHONPATH=. python tests/golden/questions.py` rewrites them, only after a deliberate change of the wire and
 docs/protocol.md.
 """
 
@@ -88,7 +88,7 @@ COMMANDS = (
 
 
 def selectors() -> list[str]:
-    """Name and parameters of each, these in the order of their names, which means nothing."""
+    """Name and parameters of each, sorted by name."""
     sent = [(one.name, one.parameters()) for one in (*QUESTIONS, *COMMANDS)]
     return [f"{name}?{';'.join(f'{key}={parameters[key]}' for key in sorted(parameters))}" for name, parameters in sent]
 

@@ -1,4 +1,4 @@
-"""What looks at files alone needs no kernels."""
+"""Tests of files need no kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The house in figures, of a small checkout made for it."""
+"""Figures of the house, on a small checkout."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_modules_are_counted_where_they_belong(checkout: Path) -> None:
 
 def test_constants_flags_and_words_are_counted(checkout: Path) -> None:
     product = figures(checkout)["areas"][PRODUCT]
-    assert product["numeric constants"] == 4  # A, B, C and SIZES; no text, and nothing that is calculated by a call
+    assert product["numeric constants"] == 4  # A, B, C, SIZES; no texts, no results of calls
     assert product["flags"] == 2
     assert product["words in docstrings and comments"] == 3 + 4 + 2 + 2
     assert (product["import levels"], product["import circles"]) == (2, 0)

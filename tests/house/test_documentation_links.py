@@ -1,4 +1,4 @@
-"""What the documents point at is there: relative links with their anchors, and paths and modules in backticks."""
+"""Targets of documents exist: relative links with anchors, paths and modules in backticks."""
 
 import re
 from collections.abc import Iterator
@@ -7,12 +7,12 @@ from pathlib import Path
 from tests.paths import DOCS, ROOT
 from tests.structure import PACKAGES
 
-LAB = [page for page in (ROOT / "lab").rglob("*.md") if page.name != "house.md"]  # which names files of other times
+LAB = [page for page in (ROOT / "lab").rglob("*.md") if page.name != "house.md"]  # it names former files
 PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")), *DOCS.rglob("*.md"), *LAB]
 TOP = "|".join((*PACKAGES, "tests", "docs", "config", r"\.ci"))
 PATH = re.compile(rf"`((?:{TOP})/(?:[\w.*-]+/)*(?:[\w*-]+\.(?:py|md|toml|urdf|c|bin|png|jpg))?)`")
 MODULE = re.compile(rf"`((?:{'|'.join(PACKAGES)})(?:\.[A-Za-z_]\w*)+)`")
-FILE = re.compile(r"`(\w+\.py)`")  # a module by its name alone
+FILE = re.compile(r"`(\w+\.py)`")  # a module by its file name
 FILES = {path.name: path for top in ("tests", *PACKAGES) for path in (ROOT / top).rglob("*.py")}
 FUNCTION = re.compile(r"`([A-Za-z_]+)\.(?!toml|md|py)([a-z_]+)`")  # Class.method or module.function
 LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]+))?\)")
@@ -45,7 +45,7 @@ def _missing(page: Path) -> Iterator[str]:
 
 
 def _is_defined(name: str) -> bool:
-    """Whether a dotted name leads to a module, or to a word in one."""
+    """Whether a dotted name leads to a module or a word in one."""
     *parents, last = name.split(".")
     if last in ("py", "toml") or (ROOT / name.replace(".", "/")).is_dir():
         return True
@@ -55,6 +55,6 @@ def _is_defined(name: str) -> bool:
 
 
 def _anchors(file: Path) -> set[str]:
-    """The headings of a page as a code host links them."""
+    """Anchors of a page's headings, as on code hosts."""
     headings = re.findall(r"^#+ (.*)$", file.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}

@@ -1,4 +1,4 @@
-"""docs/guarantees.md: each claim has rows of fault, history and verdict, and what they name is there."""
+"""docs/guarantees.md: every claim has rows of fault, history and verdict, naming existing things."""
 
 import re
 
@@ -11,7 +11,7 @@ VERDICTS = ("holds", "in part", "open")
 
 
 def _rows(text: str) -> list[list[str]]:
-    """Cells of every table, without heads."""
+    """Cells of all tables, without heads."""
     lines = [
         line for line in text.splitlines() if line.startswith("| ") and not line.startswith(("| fault |", "| ---"))
     ]
@@ -34,7 +34,7 @@ def test_every_row_has_a_fault_a_history_and_a_verdict() -> None:
 
 def test_every_claim_has_a_table() -> None:
     claims = re.split(r"^### ", CLAIMS, flags=re.MULTILINE)[1:]
-    # The first two share theirs: a fault that loses may as well double.
+    # The first two share theirs, since a losing fault may double as well.
     assert [claim.splitlines()[0] for claim in claims[1:] if not _rows(claim)] == []
 
 

@@ -1,4 +1,4 @@
-"""Faults to plant: those by hand stand once in the product, those that are drawn leave Python that can be read."""
+"""Planted faults: written ones match once in the product, drawn ones leave parsable Python."""
 
 from __future__ import annotations
 

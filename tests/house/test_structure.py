@@ -1,4 +1,4 @@
-"""The house: folders taken in at a glance, modules read in one go, imports that run one way, options that are few."""
+"""Structure: small folders, short modules, one-way imports, few options."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import pytest
 from tests.paths import ROOT
 from tests.structure import CONFIGS, PACKAGES, crowds, is_description, modules, options
 
-MOST_MODULES = 16  # of a folder, beside __init__
-LIST = Path("sitegrid/commands")  # one module a command: `sitegrid --help` is its table of contents
+MOST_MODULES = 16  # per folder, besides __init__
+LIST = Path("sitegrid/commands")  # one module per command, as in `sitegrid --help`
 MOST_OPTIONS = 60
 
-# Contracts of pyproject.toml by their first words, each with an import that breaks it: where it is planted, and what.
+# Contracts of pyproject.toml by their first words, each with a violating import and its place.
 PLANTED = {
     "Layers: the laboratory": ("sitegrid/proof/delivery.py", "import lab.paper"),
     "An agent never sees": ("agents/pipeline.py", "import sim.state"),
@@ -32,7 +32,7 @@ PLANTED = {
     "Layers of the laboratory": ("lab/campaign/workers.py", "import lab.maps.cases"),
     "No import runs in a circle": ("protocol/site/geometry.py", "import protocol.wire.messages"),
 }
-# What the functional core must not know, each planted into another of its rooms.
+# Imports forbidden to the functional core, each planted in another part.
 CORE = {
     "zenoh": "agents/pipeline.py",
     "sqlite3": "agents/delivery/uplink.py",
@@ -45,7 +45,7 @@ CORE = {
 
 
 def linted(folder: Path, planted: dict[str, list[str]]) -> str:
-    """What lint-imports prints of a copy of the packages in which imports were planted."""
+    """Output of lint-imports on a copy of the packages with planted imports."""
     for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__", "*.urdf"))
     shutil.copy(ROOT / "pyproject.toml", folder)

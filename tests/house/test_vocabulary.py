@@ -1,6 +1,6 @@
-"""One word per thing: private words that standard terms replaced do not come back (docs/glossary.md).
+"""One word per thing: replaced private words do not return (docs/glossary.md).
 
-Identifiers, options, keys of configuration files and headings are looked at; sentences are not.
+Checks identifiers, options, configuration keys and headings, not sentences.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pytest
 
 from tests.paths import ROOT
 
-# The word, and what it was replaced by.
+# Word, and replacement.
 REPLACED = {
     "ladder": "timeline",
     "rung": "tier",
@@ -38,7 +38,7 @@ REPLACED = {
 }
 WHOLE = dict.fromkeys(("found", "of"), "a noun that says what it is") | dict.fromkeys(("gives", "says"), "measures")
 PAIRS = {("left", "out"): "excluded", ("put", "aside"): "quarantine", ("way", "m"): "distance_m"}
-# Of the field, or of the language.
+# Of the field or the language.
 COMPOUNDS = {
     tuple(compound.split()) for compound in (*("dead reckoning", "dead reckoned", "data sheet", "data sheets"),)
 }
@@ -50,7 +50,7 @@ def tracked(*patterns: str) -> list[Path]:
 
 
 def replaced(name: str) -> str:
-    """What a name should say instead, or nothing."""
+    """The better word for a name, or empty."""
     if name in WHOLE:
         return WHOLE[name]
     words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
@@ -67,7 +67,7 @@ def replaced(name: str) -> str:
 
 
 def identifiers(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Names that a module makes, with their lines: what it only uses of libraries is theirs."""
+    """Names defined by a module, with lines; not those of libraries."""
     for node in ast.walk(tree):
         match node:
             case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):

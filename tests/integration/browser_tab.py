@@ -1,4 +1,4 @@
-"""The live page in a browser that tests drive, and what it complained of. Needs Chromium (Debian: `chromium`)."""
+"""The live page in a driven browser, with its complaints. Needs Chromium (Debian: `chromium`)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ NOBODY = "http://nobody.invalid/**"
 
 
 def launched() -> Iterator[Any]:
-    """A browser that is closed at the end."""
+    """A browser for the length of the test."""
     from playwright.sync_api import Error, sync_playwright
 
     with sync_playwright() as playwright:
-        try:  # in containers: no user namespaces, little shared memory
+        try:  # containers have no user namespaces and little shared memory
             arguments = ["--no-sandbox", "--disable-dev-shm-usage"]
             browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
         except Error as error:
@@ -34,7 +34,7 @@ def launched() -> Iterator[Any]:
 
 
 class Tab:
-    """A page, and what its browser complained of."""
+    """A page and its browser's complaints."""
 
     def __init__(self, browser: Any, url: str, **options: Any) -> None:
         self.complaints: list[str] = []
@@ -44,8 +44,8 @@ class Tab:
         self.page.on("console", lambda message: self._note(message.type, message.text))
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
-        # Tests may answer in the server's place. A browser that is told to only once the page is there, still asks the
-        # server for a moment: 4 times in 150 on a busy machine. So its requests are looked at from the start.
+        # Tests may answer in place of the server. Routes set up after loading miss some requests for a moment (4 times
+        # in 150 on a busy host), so requests are intercepted from the start.
         self.page.route(NOBODY, lambda route: route.abort())
         self.page.goto(url)
 
@@ -57,7 +57,7 @@ class Tab:
         return self.page.evaluate(expression)
 
     def until(self, expression: str) -> None:
-        """Wait until an expression holds; the page's own rules forbid the browser's way to wait."""
+        """Wait for an expression; the page's rules forbid the browser's own way."""
         for _ in range(int(WAIT_MS / 50)):
             if self.js(expression):
                 return
@@ -65,7 +65,7 @@ class Tab:
         raise AssertionError(f"did not come true: {expression}; {self.complaints}")
 
     def drawn(self) -> None:
-        """Wait for two frames of the browser: what was asked for before is done."""
+        """Wait for two animation frames: earlier requests are done."""
         self.js("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     def loaded(self) -> Tab:
@@ -78,7 +78,7 @@ class Tab:
         return left, top
 
     def serious_faults(self, axe: str) -> list[Any]:
-        """What axe finds of a page that came without its own rules for scripts."""
+        """axe's findings on a page loaded without its script rules."""
         self.until("document.getAnimations().every((one) => one.playState !== 'running')")
         self.page.evaluate(axe)
         script = "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
@@ -89,7 +89,7 @@ class Tab:
 
 
 def watched(browser: Any, url: str) -> Iterator[Tab]:
-    """A tab for one test, which then complained of nothing and asked nobody else."""
+    """A tab for one test, without complaints or foreign requests at its end."""
     tab = Tab(browser, url).loaded()
     yield tab
     assert tab.complaints == []
@@ -98,7 +98,7 @@ def watched(browser: Any, url: str) -> Iterator[Tab]:
 
 
 def axe_script(folder: Path) -> str:
-    """axe-core, which npm installs; the test is skipped where it cannot."""
+    """axe-core from npm, or skip."""
     npm = shutil.which("npm")
     if npm is None:
         pytest.skip("no npm: axe-core is installed by it")

@@ -1,4 +1,4 @@
-"""What PostgreSQL's image does, with the programs of this host: data made once, scripts run, then the server itself."""
+"""PostgreSQL's image with local programs: create data, run scripts, serve."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 
 from tests.postgres_server import USER, as_user, binaries
 
-DATABASE = "postgres:"  # how its image is called
+DATABASE = "postgres:"  # name of its image
 SCRIPTS = "/docker-entrypoint-initdb.d/"
 END_S = 30.0
 
 
 class DatabaseServer:
-    """One service. folder: another user may use the one that it is in; files: of this host, by their place inside."""
+    """One service. folder: accessible to another user. files: on this host, by their place inside."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str], files: Mapping[str, Path]) -> None:
         self.folder, self._files, self._options = folder, files, as_user()
@@ -30,7 +30,6 @@ class DatabaseServer:
 
     @property
     def data(self) -> str:
-        """Its folder PGDATA."""
         return self._environment["PGDATA"]
 
     @property
@@ -40,11 +39,10 @@ class DatabaseServer:
 
     @property
     def code(self) -> int | None:
-        """Exit code, None while it runs."""
         return self._process.poll() if self._process else None
 
     def initialise(self) -> None:
-        """As the image does at its first start: data, a database, and scripts while nobody else can connect."""
+        """Like the image's first start: data, a database, scripts without other connections."""
         e, port = self._environment, ["-o", "-c listen_addresses= -c unix_socket_directories=" + str(self.folder)]
         user, data = e["POSTGRES_USER"], e["PGDATA"]
         method = e["POSTGRES_HOST_AUTH_METHOD"]
@@ -57,12 +55,11 @@ class DatabaseServer:
         self.do("pg_ctl", "stop", "-w", "-m", "fast", "-D", data)
 
     def enter(self, words: Sequence[str]) -> None:
-        """Start through an entry point of the compose file's own."""
+        """Start through the compose file's own entry point."""
         program, script, *rest = words
         self.run([program, str(self._copied(self._files[script])), *rest])
 
     def run(self, words: Sequence[str]) -> None:
-        """Start the server."""
         sockets = ("-c", f"unix_socket_directories={self.folder}")
         with (self.folder / "log").open("ab") as log:
             self._process = subprocess.Popen(
@@ -70,7 +67,7 @@ class DatabaseServer:
             )
 
     def do(self, *words: str) -> None:
-        """Run a program beside it, as `docker compose exec` does."""
+        """Run a program beside it, like `docker compose exec`."""
         done = subprocess.run(
             words, capture_output=True, text=True, cwd=self.folder, check=False, **self._with_environment()
         )
@@ -85,7 +82,7 @@ class DatabaseServer:
         return self._process.wait(timeout_s)
 
     def stop(self) -> int:
-        """End it as its image says: SIGINT ends all sessions."""
+        """Stop as the image specifies: SIGINT ends all sessions."""
         self.send(signal.SIGINT)
         try:
             return self.wait(END_S)

@@ -1,7 +1,7 @@
-"""compose.yaml without an engine: its commands as local processes, in its order, with its health checks.
+"""compose.yaml without an engine: its commands as local processes, in order, with health checks.
 
-A service's host name becomes a free port on loopback, a volume a folder, the image's working directory the project. Of
-PostgreSQL's image the programs of this host are run, after what its entry point does.
+Host names become free loopback ports, volumes folders, the working directory the project. PostgreSQL's image is
+replaced by local programs and the work of its entry point.
 """
 
 from __future__ import annotations
@@ -23,19 +23,18 @@ from sitegrid.process.children import Child, Children, ProcessError
 from tests.integration.compose_database import DATABASE, DatabaseServer
 from tests.postgres_server import binaries
 
-NOT_HERE = ("", "PATH", "NUMBA_CACHE_DIR")  # in an empty folder each service would compile the kernels anew
+NOT_HERE = ("", "PATH", "NUMBA_CACHE_DIR")  # with an empty folder each service would compile kernels
 _ENV = re.compile(r"^ENV (?P<pairs>(?:.*\\\n)*.*)$", re.MULTILINE)
-CHECK_S = 0.5  # between two health checks, in place of the file's own
+CHECK_S = 0.5  # between health checks, in place of the file's value
 
 
 def load(path: Path) -> dict[str, Any]:
-    """The services of a compose file."""
     services: dict[str, Any] = YAML(typ="safe").load(path.read_text())["services"]
     return services
 
 
 def needed(services: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    """Those that `docker compose up NAMES` starts, with all that they depend on; without names, all without profile."""
+    """Services started by `docker compose up NAMES`, with dependencies; without names, all without profile."""
     wanted = set(names or (name for name, service in services.items() if not service.get("profiles")))
     while more := {other for name in wanted for other in services[name].get("depends_on", {})} - wanted:
         wanted |= more
@@ -43,7 +42,7 @@ def needed(services: Mapping[str, Any], *names: str) -> dict[str, Any]:
 
 
 def image_environment(dockerfile: Path) -> dict[str, str]:
-    """What the image sets, but NOT_HERE."""
+    """The image's environment without NOT_HERE."""
     pairs = [p for match in _ENV.finditer(dockerfile.read_text()) for p in shlex.split(match["pairs"])]
     return {
         name: value
@@ -54,10 +53,10 @@ def image_environment(dockerfile: Path) -> dict[str, str]:
 
 @dataclass
 class ComposeRun:
-    """The services of one file, started one after the other as it says.
+    """The services of one file, started in its order.
 
-    ports: of this host, by those inside; health: codes of each service's checks, newest last. databases: folder that
-    another user may use, where there are any.
+    ports: on this host, by those inside. health: check results per service, newest last. databases: folder accessible
+    to another user, if needed.
     """
 
     services: Mapping[str, Any]
@@ -72,16 +71,16 @@ class ComposeRun:
         self.ports |= {port: free_port() for port in listened_on(self.services)}
 
     def up(self) -> None:
-        """Start every service once what it depends on is as it has to be."""
+        """Start each service once its dependencies are ready."""
         for name in self.services:
             self._start(name)
 
     def words(self, name: str, line: Sequence[str]) -> list[str]:
-        """A command of a service, for this host."""
+        """A service's command for this host."""
         return [self._here(name, word) for word in line]
 
     def check(self, name: str) -> bool:
-        """Run the health check of a service once."""
+        """Run a service's health check once."""
         health = self.services[name]["healthcheck"]
         kind, program, *rest = health["test"]
         assert kind == "CMD", "no shell is in the way"
@@ -97,11 +96,11 @@ class ComposeRun:
         return code == 0
 
     def down(self) -> dict[str, int]:
-        """End all, those first that depend on others; their exit codes."""
+        """Stop everything, dependents first; returns exit codes."""
         return {name: child.stop() for name, child in reversed(self.started.items())}
 
     def start_again(self, name: str) -> Child | DatabaseServer:
-        """As an engine does with a service that has ended and may start again."""
+        """Restart an ended service, like an engine."""
         assert self.services[name]["restart"] == "unless-stopped"
         assert self.started[name].code is not None
         del self.started[name]
@@ -138,7 +137,7 @@ class ComposeRun:
         return made
 
     def _wait_healthy(self, name: str) -> None:
-        """Fails as an engine would: after so many retries once the time to start is over."""
+        """Fails like an engine: after the retries that follow the start period."""
         health = self.services[name]["healthcheck"]
         patience_s = _seconds(health["start_period"]) + health["retries"] * _seconds(health["interval"])
         end_s = time.monotonic() + patience_s
@@ -170,12 +169,11 @@ def listened_on(services: Mapping[str, Any]) -> set[str]:
 
 
 def _volumes(service: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Where a volume or a file comes from, and where it is inside."""
+    """Sources and targets of volumes and files."""
     return [(volume.split(":")[0], volume.split(":")[1]) for volume in service.get("volumes", [])]
 
 
 def free_port() -> int:
-    """A port of loopback that is free now."""
     return int(free_endpoint().rsplit(":", 1)[1])
 
 

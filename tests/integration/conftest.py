@@ -1,4 +1,4 @@
-"""Fixtures: a construction site of real processes, every one of them ended with the test."""
+"""Fixtures: sites of real processes, all ended with the test."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    """A site on the web where machines drove for a minute: for tests that read, and leave it as it was or driven on."""
+    """A site on the web after a minute of driving; tests read it, or drive on."""
     folder = tmp_path_factory.mktemp("web")
     with Forks(folder) as started:
         site = WebSite(folder, started, "--host", "map.example")
@@ -34,7 +34,7 @@ def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
 
 @pytest.fixture(scope="session")
 def hauling(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    """A site on the web whose roads haulers drove for four days; tests leave it as it was."""
+    """A site on the web after four days of haulers; read-only."""
     folder = tmp_path_factory.mktemp("hauling")
     with Forks(folder) as started:
         yield hauling_site(folder, started)
@@ -48,7 +48,7 @@ def children(tmp_path: Path) -> Iterator[Forks]:
 
 @pytest.fixture
 def site(tmp_path: Path, children: Forks) -> SiteRun:
-    """A site where nobody drives; nothing of it runs yet."""
+    """A site without drivers; nothing runs yet."""
     return SiteRun(tmp_path, children, free_endpoint(), NOBODY_DRIVES)
 
 

@@ -1,7 +1,7 @@
-"""Processes of a site that begin with their libraries loaded, as forks of a server that does nothing else.
+"""Processes of a site forked from a server with loaded libraries.
 
-A start takes a tenth of the processor time. Kills, signals, exit codes and files are those of any process. How a
-command loads is for tests that start it themselves.
+A start takes a tenth of the CPU time; kills, signals, exit codes and files are real. Tests of loading start commands
+themselves.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CONTEXT.set_forkserver_preload([__name__, *LOADED])
 
 
 class Fork:
-    """`sitegrid <words>`; the part of subprocess.Popen that a Child uses."""
+    """`sitegrid <words>`, with the part of subprocess.Popen that Child uses."""
 
     def __init__(self, words: list[str], errors: IO[bytes] | None) -> None:
         read, output = CONTEXT.Pipe(duplex=False)
@@ -61,7 +61,7 @@ class Fork:
 
 
 def run(words: list[str], output: Connection, log: Path, folder: Path, environment: dict[str, str]) -> None:
-    """In the new process: the command, as one that was started from a shell."""
+    """In the new process: run the command as if started from a shell."""
     os.setsid()
     for source, number in ((os.open(os.devnull, os.O_RDONLY), 0), (output.fileno(), 1)):
         os.dup2(source, number)
@@ -79,7 +79,7 @@ def run(words: list[str], output: Connection, log: Path, folder: Path, environme
 
 
 def cpu_s() -> float:
-    """Processor time of the server of the forks and of those that have ended."""
+    """CPU time of the fork server and its ended forks."""
     if not (pid := forkserver._forkserver._forkserver_pid):
         return 0.0
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
@@ -92,6 +92,4 @@ class ForkedChild(Child):
 
 
 class Forks(Children):
-    """Children of a test."""
-
     child = ForkedChild

@@ -1,4 +1,4 @@
-"""Haulers on roads of known ground, day after day, and a site on the web whose map they make."""
+"""Haulers on roads of known ground for days, and a site on the web with their map."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ PASSES = 5
 
 
 class Hauler:
-    """A machine that drives passes over roads, one batch a day."""
+    """A machine with one batch of passes over roads per day."""
 
     def __init__(self, name: str, days: list[Table]) -> None:
         self.name, self._days, self._seq = name, days, 0
 
     def drive(self, from_s: float, frame: str) -> bytes:
-        """The batch of the day that `from_s` stands for, BATCH_S a day."""
+        """The batch of the day at `from_s`, BATCH_S per day."""
         rows = self._days[round(from_s / BATCH_S)]
         batch = SampleBatch(self.name, 7, self._seq + 1, rows, frame)
         self._seq += len(rows)
@@ -39,9 +39,9 @@ class Hauler:
 
 
 def haulers() -> list[Hauler]:
-    """Three machines, each on a road of its own.
+    """Three machines, each on its own road.
 
-    One road becomes worse by 0.005 a day; one is repaired on the last day; on one nobody says what the machine weighs.
+    One road worsens by 0.005 a day; one is repaired on the last day; on one no mass is stated.
     """
     at = [day * DAY_S for day in range(DAYS)]
     worse = [passes(WORSE, PASSES, 0.04 + 0.005 * day, day, at[day]) for day in range(DAYS)]
@@ -56,9 +56,9 @@ def haulers() -> list[Hauler]:
 
 
 def hauling_site(folder: Path, children: Children) -> WebSite:
-    """The site once they have driven."""
+    """The site after the drives."""
     site = WebSite(folder, children)
     site.machines = haulers()  # type: ignore[assignment]
     site.drive(DAYS * BATCH_S)
-    site.client.ask(WorklistQuery(after=site.client.info().merged))  # roads are of all that they drove from here on
+    site.client.ask(WorklistQuery(after=site.client.info().merged))  # from here on roads include all drives
     return site

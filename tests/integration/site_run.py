@@ -1,4 +1,4 @@
-"""A construction site of real processes on loopback, with free ports; every process is ended with the test."""
+"""A site of real processes on free loopback ports, ended with the test."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ from sitegrid.process.children import Child, Children
 from sitegrid.proof.delivery import AuditResult, audit_store
 from tests.patience import PATIENCE_S, until
 
-LAG_S = 4.0  # of the smoother: most drives here are shorter than its usual lag, and tests wait for samples
+LAG_S = 4.0  # smoother lag: drives are short, and tests wait for samples
 NOBODY_DRIVES = SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
 
 
 class SiteRun:
-    """Router, map server, agents and simulator of one site."""
-
     def __init__(self, folder: Path, children: Children, endpoint: str, sim: SimConfig, lag_s: float = LAG_S) -> None:
         self.folder = folder
         self.children = children
@@ -61,7 +59,7 @@ class SiteRun:
             self.start_agent(config)
 
     def start(self) -> tuple[Child, Child, Child]:
-        """Everything; returns the router, the server and the simulator."""
+        """Start everything; returns router, server, simulator."""
         router, server = self.start_router(), self.start_server()
         self.start_agents()
         return router, server, self.start_sim()
@@ -82,7 +80,7 @@ class SiteRun:
         return {name: agent.expect("ended", PATIENCE_S)["ended"] for name, agent in self.agents.items()}
 
     def delivered(self) -> dict[str, dict]:
-        """The agents' reports at their end; all has been delivered."""
+        """Final agent reports; everything is delivered."""
         reports = self.end_of_agents()
         assert all(report["delivered"] for report in reports.values())
         return reports
@@ -93,6 +91,6 @@ class SiteRun:
 
 
 def kill(child: Child) -> None:
-    """End a process without a chance to tidy up."""
+    """Kill a process without cleanup."""
     child.send(signal.SIGKILL)
     child.wait(PATIENCE_S)

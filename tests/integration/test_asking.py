@@ -1,4 +1,4 @@
-"""What a client sees while router or server come and go (docs/protocol.md, Answers that do not come)."""
+"""Clients while router or server come and go (docs/protocol.md, Answers that do not come)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.processes
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SiteRun]:
-    """Router and server, which each test leaves as it found them."""
+    """Router and server, left unchanged by each test."""
     folder, sim = tmp_path_factory.mktemp("asked"), NOBODY_DRIVES
     with Forks(folder) as children:
         run = SiteRun(folder, children, free_endpoint(), sim)
@@ -36,7 +36,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SiteRun]:
 
 @pytest.fixture
 def asking() -> Iterator[Callable[[Client], Future[MapInfo]]]:
-    """Asks on a thread of its own; the question is out when this returns."""
+    """Asks on a thread; the query is out on return."""
     with ThreadPoolExecutor(1) as pool:
 
         def ask(client: Client) -> Future[MapInfo]:
@@ -56,7 +56,7 @@ def asking() -> Iterator[Callable[[Client], Future[MapInfo]]]:
 
 
 class _Noted:
-    """A session whose questions are noted."""
+    """A session that records its queries."""
 
     def __init__(self, session, get) -> None:
         self._session, self.get = session, get
@@ -66,7 +66,7 @@ class _Noted:
 
 
 def raw(client: Client, timeout_s: float) -> list[bytes]:
-    """Replies of Zenoh itself: errors alone are expected."""
+    """Zenoh's own replies: errors only."""
     replies = client.session.get(keys.map_query(client.site, "info"), timeout=timeout_s)
     return [reply.err.payload.to_bytes() for reply in replies]
 

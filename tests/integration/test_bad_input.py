@@ -1,4 +1,4 @@
-"""Bad input to real processes: one counted refusal each, a clear error, an untouched journal, and service goes on."""
+"""Bad input to real processes: one counted refusal, a clear error, an untouched journal, continued service."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ pytestmark = pytest.mark.processes
 
 NOW_NS = 1_767_225_600_000_000_000
 MACHINE = "probe"
-UNCHANGED = ("journalled", "merged", "samples_merged", "cells", "stamp_ns", "machines")  # by what is refused
+UNCHANGED = ("journalled", "merged", "samples_merged", "cells", "stamp_ns", "machines")  # unchanged by refusals
 
 
 class Probe:
-    """A site with router and server, and a session that sends it whatever a test likes."""
+    """A site with router and server, and a session for arbitrary input."""
 
     def __init__(self, run: SiteRun) -> None:
         self.router, self.server, self.run = run.start_router(), run.start_server(), run
@@ -80,7 +80,7 @@ def probe(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Probe]:
 
 
 def edited(probe: Probe, **fields: Any) -> bytes:
-    """A good batch with other fields, None for none."""
+    """A valid batch with changed fields, None: removed."""
     table = {**msgpack.unpackb(encode_batch(probe.batch())), **fields}
     return bytes(msgpack.packb({name: value for name, value in table.items() if value is not None}))
 
@@ -108,7 +108,7 @@ BAD_BATCHES = {
 @pytest.mark.parametrize("name", BAD_BATCHES)
 def test_a_bad_batch_is_refused_counted_and_leaves_no_trace(probe: Probe, name: str):
     make, reason, problem = BAD_BATCHES[name]
-    probe.client.point(1.0, 1.0)  # what came before is folded for it, and its cells are counted
+    probe.client.point(1.0, 1.0)  # folds and counts earlier samples
     before = probe.client.info()
     reply = probe.send(make(probe))
     assert isinstance(reply, Refused), f"{reply}: {probe.where}"
@@ -164,13 +164,13 @@ def test_a_bad_query_is_refused_counted_and_named(probe: Probe, selector: str):
 
 @pytest.mark.nightly
 def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children: Forks, tmp_path):
-    """The server's site is smaller than the agent's: what lies beyond it is refused, the way back in arrives."""
+    """The server's site is smaller than the agent's: samples beyond it are refused, later ones arrive."""
     sim = SimConfig(machines=1, seconds=60, speed=10, seed=3, world="fast")
     run = SiteRun(tmp_path, children, free_endpoint(), sim)
     wide = run.site_file.read_text()
     lines = [line for line in wide.splitlines() if not line.startswith("extent_m")]
     router = run.start_router()
-    # Where the machine drives is known from a first look: half of what it sees lies within the median.
+    # Half of a recorded drive lies within the median.
     children.start("record", "sim", "--record", tmp_path / "logs", *words(sim)).wait(PATIENCE_S)
     extent_m = middle_of(tmp_path / "logs" / "loader-1", run)
     run.site_file.write_text("\n".join([f"extent_m = {extent_m}", *lines]) + "\n")
@@ -202,7 +202,7 @@ def words(sim: SimConfig) -> list[str]:
 
 
 def middle_of(log: Any, run: SiteRun) -> float:
-    """The extent that about half of a recorded drive lies within [m]."""
+    """Extent that contains about half of a recorded drive [m]."""
     from protocol.machine.log_folder import open_log
     from protocol.machine.readings import Gps
     from protocol.site.site_config import Projection

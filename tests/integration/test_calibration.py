@@ -1,4 +1,4 @@
-"""Corrections of machines through real processes: asked for, after accidents, refused, folded elsewhere."""
+"""Corrections of machines through real processes: on request, after accidents, refused, folded elsewhere."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ DRIVES = {
     "b": drive(RAMP, Errors(zero=-0.006, scale=0.05), seed=2, seconds=240),
     "c": drive(RAMP_AGAIN, Errors(scale=-0.04), seed=3, seconds=240),
 }
-ASKED = "[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n"  # nothing moves but what a test asks for
+ASKED = "[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n"  # only requested corrections
 ZERO = 0.02
 
 
@@ -61,7 +61,7 @@ def stored(folder: Path, site: SiteRun) -> closing[Store]:
 
 
 def folded(site: SiteRun, corrections: SampleCorrections, sent: dict[str, Table]) -> Grid:
-    """The fold of all that was sent from the start, corrected in numpy."""
+    """Fold of all sent samples, corrected in numpy."""
     grid = Grid(load_site(site.site_file).cell_m, ServerConfig().fold)
     for name, rows in sent.items():
         out = rows.copy()
@@ -111,17 +111,17 @@ def test_asked_for_the_map_is_that_of_a_first_fold_everywhere(site: SiteRun):
 
 
 def killed_with_a_fact_on_disk(site: SiteRun, server: Child) -> None:
-    """Kill a server right after a decision is on its disk, whether it has folded again or not."""
+    """Kill a server right after storing a decision, before or after its fold."""
     with site.connect() as client:
         try:
             client.correct("a", "levelled", zero=ZERO, wait_s=0.0)
-        except Exception as error:  # the answer: it is kept, but the map is not folded yet
+        except Exception as error:  # the decision is stored, but not folded yet
             assert "the decision is kept" in str(error)  # noqa: PT017
     kill(server)
 
 
 def with_an_old_snapshot(site: SiteRun, server: Child) -> None:
-    """Stop a server, decide, and give it back the snapshot that it had before."""
+    """Stop a server, decide, and restore its earlier snapshot."""
     server.stop()
     old = next(iter((site.folder / "store").glob("snapshot-*")))
     kept = old.read_bytes()
@@ -155,7 +155,7 @@ def test_after_an_accident_the_next_start_has_the_fact_in_its_map(
 
 @pytest.mark.nightly
 def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path: Path, children: Children):
-    """It comes with the first acknowledgement of samples, and counts at a standstill or at the end of a tour."""
+    """Offered with the first acknowledgement of samples; applied at a standstill or at a tour's end."""
     sim = SimConfig(machines=2, seconds=160, speed=10, seed=3, world="fast")
     site = SiteRun(tmp_path, children, free_endpoint(), sim)
     one, other = (config.stem for config in site.configs)

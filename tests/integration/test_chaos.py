@@ -1,4 +1,4 @@
-"""The fault suite in short: one run of each fault, with real processes; all of it is `make chaos`."""
+"""The fault suite in short, one run per fault; in full: `make chaos`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_samples_that_wait_for_the_smoother_outlive_kills_and_silence(tmp_path, 
 
 
 def harmless(tmp_path: Path, fault: Callable[[FaultRun], FaultOutcome]) -> FaultOutcome:
-    """The outcome of a fault that strikes a site of two machines and takes nothing."""
+    """Outcome of a fault on a site of two machines, without losses."""
     recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=80)
     outcome = fault(scenario(tmp_path / "run", recordings=recordings))
     assert (outcome.lost, outcome.double, outcome.silent, outcome.problems) == (0, 0, 0, [])
@@ -161,7 +161,7 @@ def test_an_interrupted_suite_ends_everything(tmp_path):
         try:
             said, _ = suite.communicate(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
-            suite.send_signal(signal.SIGABRT)  # it says where it hangs
+            suite.send_signal(signal.SIGABRT)  # prints where it hangs
             raise
         assert said.splitlines()[-1] == "interrupted; everything is ended"
         assert suite.returncode == 130

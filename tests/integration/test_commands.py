@@ -1,5 +1,3 @@
-"""The commands as a person or a script uses them."""
-
 from __future__ import annotations
 
 import json

@@ -1,4 +1,4 @@
-"""compose.yaml does what it says: its very commands run as local processes, and machines draw a map."""
+"""compose.yaml works: its commands run as local processes, and machines draw a map."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 
 
 def known_machines(client: Client) -> set[str]:
-    """Machines with samples in the map; none while the server is busy making its kernels, as a new image does."""
+    """Machines in the map; empty while a fresh image compiles kernels."""
     try:
         return set(client.info().machines)
     except SitegridError:
@@ -33,7 +33,7 @@ def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
     for name, value in compose_run.image_environment(root / "Dockerfile").items():
         monkeypatch.setenv(name, value.replace("/tmp/", f"{tmp_path}/tmp/"))
     services = compose_run.needed(compose_run.load(root / "compose.yaml"))
-    services["sim"]["command"] += ["--speed", "4"]  # samples come after the smoother's lag of a minute and a half
+    services["sim"]["command"] += ["--speed", "4"]  # samples lag by the smoother's 90 s
     run = compose_run.ComposeRun(services, tmp_path, children)
     run.up()
     order = list(run.started)
@@ -55,7 +55,7 @@ def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
     assert checked == ["router", "server", "web"]
     assert all(run.check(name) for name in checked)
     assert {name: child.code for name, child in run.started.items()} == dict.fromkeys(services), "none has ended"
-    # An agent whose stream has ended is on its way out already; a signal in its last moment is Python's to take.
+    # An ended stream's agent is exiting: Python takes a signal in its last moment.
     assert set(run.down().values()) <= {0, -signal.SIGTERM}, "none had to be killed"
 
 

@@ -1,4 +1,4 @@
-"""The profile `ha` of compose.yaml as local processes: the writer is killed, then the database's primary."""
+"""compose.yaml's profile `ha` as local processes: writer killed, then the database's primary."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from tests.takeover.site import verdict
 
 pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 SERVERS = ("server-a", "server-b")
-REPLACED = 3  # exit code of a server that another one took over from
+REPLACED = 3  # exit code after another server took over
 ROWS = "SELECT row, record FROM sitegrid.journal ORDER BY row"
 
 
 class HighlyAvailable:
-    """The services that `docker compose --profile ha up follower` starts, and two machines that send."""
+    """The services of `docker compose --profile ha up follower`, and two sending machines."""
 
     def __init__(self, run: compose_run.ComposeRun, root: Path, children: Children) -> None:
         self.run, self.children, self.folder = run, children, run.folder
@@ -50,14 +50,14 @@ class HighlyAvailable:
         return child
 
     def which(self, state: str) -> list[str]:
-        """Servers that have said so of themselves."""
+        """Servers that reported this state."""
         for name in SERVERS:
             said = self.said.setdefault(self.server(name).pid, set())
             said.update(key for line in self.server(name).lines() for key in line)
         return [name for name in SERVERS if state in self.said[self.server(name).pid]]
 
     def wait_for_acknowledgements(self, beyond: int = 0, count: int = 20) -> float:
-        """Until each machine has so many more, under an epoch beyond one; when the first of them came."""
+        """Wait for each machine's next acknowledgements with an epoch above `beyond`; returns the first one's time."""
         before = {one.machine: len(one.acknowledged) for one in self.senders}
 
         def new(one: Sender) -> list[float]:
@@ -90,7 +90,7 @@ def test_profile_ha_survives_its_writer_and_its_primary_and_its_follower_answers
     pids = {name: child.pid for name, child in run.started.items()}
     assert len(set(pids.values())) == len(services), f"a process each: {pids}"
 
-    # Two servers that started at once on a new database: one serves, the other waits.
+    # Two servers start at once on a new database: one serves, the other waits.
     until(lambda: len(site.which("ready")) == 1 and len(site.which("standby")) >= 1, "one serves, one waits")
     follower = run.started["follower"]
     assert isinstance(follower, Child)

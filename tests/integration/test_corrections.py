@@ -1,4 +1,4 @@
-"""Corrections, as real processes: from a caster to the port of a machine's receiver, and what its health says."""
+"""Corrections through real processes: from a caster to a receiver's port, and their health."""
 
 from __future__ import annotations
 

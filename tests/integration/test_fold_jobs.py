@@ -1,4 +1,4 @@
-"""`sitegrid fold` by processes and by a Dask cluster: the same store, also where these are killed in the middle."""
+"""`sitegrid fold` by processes and a Dask cluster: the same store, even if they are killed midway."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.processes
 FILES = 12
 MOST_FOLDS = 8  # until a worker dies in one
-# The command with smaller tasks, so that there are many of them.
+# The command with many small tasks.
 FOLD = (
     "import sys; from sitegrid.refold.engine import Cluster as C; C.task_samples = 1; from sitegrid.cli import main; "
 )
@@ -55,14 +55,14 @@ def write(folder: Path, site: SiteConfig, numbers: range) -> None:
 
 @pytest.fixture(scope="module")
 def expected(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What one process makes of it."""
+    """Result of one process."""
     out = tmp_path_factory.mktemp("expected") / "store"
     assert main(["fold", str(archive), "--out", str(out), "--json"]) == 0
     return contents(out)
 
 
 def contents(store: Path) -> dict[str, str]:
-    """All that does not have the store's random id in it, and the names of the others."""
+    """Contents without the store's random id, and the names of the other files."""
     files = {path for path in store.rglob("*") if path.is_file() and path.name not in ("lock", "journal.db-mark")}
     hashes = {".toml": Path.read_text, ".checkpoint": evidence_hash}
     return {str(path.relative_to(store)): hashes.get(path.suffix, lambda _: "")(path) for path in files}
@@ -73,7 +73,7 @@ def started(*words: object) -> subprocess.Popen[bytes]:
 
 
 def children_of(pid: int) -> set[int]:
-    """Processes that any thread of a process has started; Python's tracker of resources is one."""
+    """Children started by any thread of a process, Python's resource tracker included."""
     return {int(word) for path in Path(f"/proc/{pid}/task").glob("*/children") for word in path.read_text().split()}
 
 
@@ -103,7 +103,7 @@ def test_a_fold_that_is_killed_goes_on(archive: Path, expected: dict[str, str], 
 
 @pytest.mark.nightly
 def test_a_fold_that_is_interrupted_at_its_terminal_says_so_in_one_line(archive: Path, tmp_path: Path) -> None:
-    """Ctrl-C reaches its workers, too."""
+    """Ctrl-C reaches its workers too."""
     words = ["fold", str(archive), "--out", str(tmp_path / "out"), "--jobs", "2"]
     pipe = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     with subprocess.Popen([sys.executable, "-c", FOLD, *words], **pipe) as fold:
@@ -120,18 +120,17 @@ def test_a_fold_that_is_interrupted_at_its_terminal_says_so_in_one_line(archive:
 
 
 class Deaths(distributed.diagnostics.plugin.SchedulerPlugin):
-    """Counts workers that leave a scheduler."""
+    """Counts workers that leave."""
 
     count = 0
 
     def remove_worker(self, *_: object, **__: object) -> None:
-        """As the scheduler calls it."""
         self.count += 1
 
 
 @pytest.fixture
 def dask(monkeypatch: pytest.MonkeyPatch) -> Iterator[distributed.LocalCluster]:
-    """A scheduler and two workers, each a process with a nanny."""
+    """A scheduler and two workers, processes with nannies."""
     monkeypatch.setattr(Cluster, "task_samples", 1)
     options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": 50}
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **options) as cluster:
@@ -162,7 +161,7 @@ def test_a_cluster_whose_workers_die_makes_the_same_store(
     dask.scheduler.add_plugin(deaths)
     dask.adapt(minimum=2, maximum=2, interval="1 s")  # a nanny may end with its worker
     with distributed.Client(dask) as client:
-        client.register_plugin(KillWorker(4.0, mode))  # less, and they die while they start, which ends a nanny
+        client.register_plugin(KillWorker(4.0, mode))  # a shorter time kills starting workers, which ends their nannies
     for number in range(MOST_FOLDS):
         out, before = tmp_path / str(number), deaths.count
         assert main(["fold", str(archive), "--out", str(out), "--engine", address(dask), "--json"]) == 0
@@ -176,7 +175,7 @@ def test_a_cluster_whose_workers_die_makes_the_same_store(
 def test_a_cluster_that_loses_all_its_workers_is_named(
     archive: Path, tmp_path: Path, dask, monkeypatch, capsys
 ) -> None:
-    """By `sys.exit` a worker takes its nanny along, and none comes in its place."""
+    """`sys.exit` ends a worker's nanny, without replacement."""
     from distributed.chaos import KillWorker
 
     monkeypatch.setattr(engine, "ALONE_S", 3.0)
@@ -192,7 +191,7 @@ def test_a_cluster_that_loses_all_its_workers_is_named(
 def test_a_scheduler_that_dies_is_named_and_the_fold_goes_on_without_it(
     archive: Path, expected: dict[str, str], tmp_path: Path
 ) -> None:
-    """A scheduler and workers as processes of their own; the first is killed."""
+    """Scheduler and workers as separate processes; the scheduler is killed."""
     out, port_file = tmp_path / "out", tmp_path / "scheduler.json"
     command = [sys.executable, "-c", "from distributed.cli.dask_scheduler import main; main()"]
     command += ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0", "--no-dashboard"]

@@ -1,4 +1,4 @@
-"""Followers as real processes: the server's map bit for bit, each query worked once, also while one dies."""
+"""Followers as real processes: the server's map bit for bit; one process per query, even if one dies."""
 
 from __future__ import annotations
 
@@ -56,21 +56,21 @@ class Followed(SiteRun):
 
 
 class Sender:
-    """Sends batches of random samples, one spool each."""
+    """Sends random batches, one spool each."""
 
     def __init__(self, run: Followed) -> None:
         self.session = open_session(SessionConfig(run.endpoint))
         self._site, self._spool = load_site(run.site_file), 0
 
     def send(self, machine: str = "a", n: int = 50) -> int:
-        """Returns the row that acknowledges the batch."""
+        """Returns the batch's acknowledged row."""
         self._spool += 1
         rows = random_samples(n, self._spool)
         batch = encode_batch(SampleBatch(machine, self._spool, 1, rows, self._site.frame))
         replies: list[zenoh.Reply] = []
         key = keys.ingest(self._site.name, machine)
 
-        def is_answered() -> bool:  # nobody may be known to a router yet that has just been joined
+        def is_answered() -> bool:  # a router just joined may know nobody yet
             replies[:] = self.session.get(key, payload=batch, timeout=60.0)
             return bool(replies)
 
@@ -108,7 +108,7 @@ def region(sender: Sender, run: Followed, follower: str, row: int) -> bytes:
 
 def roads(sender: Sender, run: Followed, follower: str, query: str, row: int) -> bytes:
     name, _, parameters = query.partition("?")
-    parameters = f"{parameters};after={row}"  # others may be of some seconds ago
+    parameters = f"{parameters};after={row}"  # others may lag by seconds
     key = keys.follower_query(run.site, follower, name) if follower else keys.map_query(run.site, name)
     return sender.ask(key, parameters).payload.to_bytes()
 
@@ -143,13 +143,13 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
                     f"{name} follows; {pids}",
                 )
             maps = [region(sender, run, name, row) for name in ("", "near", "far")]
-            assert maps[0] == maps[1] == maps[2], pids  # all of the answer, to the byte
+            assert maps[0] == maps[1] == maps[2], pids  # to the byte
             lines = ("route?line=-40,-40,0,10,40,40", "way?from=-40,-40;to=40,30;max_grade=1")
             for query in (
                 "segments",
                 "worklist",
                 *lines,
-            ):  # of a server that followed, and of processes that read it all
+            ):  # a server that followed, and processes that read everything
                 answers = [roads(sender, run, name, query, row) for name in ("", "near", "far")]
                 assert answers[0] == answers[1] == answers[2], (query, pids)
             drawn = [tiles(sender, run, name) for name in ("", "near", "far")]
@@ -162,7 +162,7 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
         all_equal(sender.send("a"))
         client.trust("b", "repaired")
         all_equal(sender.send("c"))
-        # ... and of the past, and what is read from the journal alone
+        # ... and the past, and what only the journal has
         past = client.point(1.0, 1.0, as_of=client.info().stamp_ns)
         assert client.origin.follower in ("near", "far"), pids
         key = keys.map_query(run.site, "point")
@@ -174,7 +174,7 @@ def decode_point_row(sender: Sender, key: str, stamp_ns: int) -> int:
 
 
 def answered(client: Client, sender: Sender, run: Followed, *followers: str) -> list[int]:
-    """How many queries each process has answered: the server, then followers."""
+    """Queries answered by the server, then by followers."""
     infos = [client.info()]
     for name in followers:
         data = sender.ask(keys.follower_query(run.site, name, "info"), "").payload.to_bytes()
@@ -199,10 +199,10 @@ def test_each_query_is_worked_by_one_process_and_by_another_while_one_dies(run: 
             origins[client] = client.origin.follower
         after = answered(clients[0], sender, run, "near", "far")
         done = [now - then for now, then in zip(after, before, strict=True)]
-        assert sum(done) - 3 == asked, pids  # and the three questions that count
-        assert done[0] == 1, pids  # the server none but that
+        assert sum(done) - 3 == asked, pids  # plus the three counting queries
+        assert done[0] == 1, pids  # the server only counted
         assert set(origins.values()) <= {"near", "far"}
-        # One is stopped with a query in work, and killed: the client gets its answer from the other.
+        # One is stopped during a query and killed: the other one answers.
         victim = next((client for client in clients if origins[client] == "near"), clients[0])
         name = origins[victim]
         child, other = (near, "far") if name == "near" else (far, "near")
@@ -215,7 +215,7 @@ def test_each_query_is_worked_by_one_process_and_by_another_while_one_dies(run: 
         thread = threading.Thread(target=ask)
         thread.start()
         thread.join(0.3)
-        assert not got, pids  # it is held by a process that does nothing
+        assert not got, pids  # held by a stopped process
         kill(child)
         thread.join(PATIENCE_S)
         assert got, pids
@@ -243,7 +243,7 @@ def test_the_map_is_read_while_the_server_is_away_and_after_it_is_back(run: Foll
         again = run.serve()
         later = sender.send()
         assert later > row, f"server pid {again.pid}, follower pid {follower.pid}"
-        # What it lacks within its second the server is asked for: `after` means what it always meant.
+        # A row that it lacks for its second is queried from the server: `after` keeps its meaning.
         assert client.ask(PointQuery(1.0, 1.0, after=later)).version.row >= later
         until(lambda: client.ask(PointQuery(1.0, 1.0, after=later)) and client.origin.follower == "near", "followed")
 
@@ -253,7 +253,7 @@ def test_the_map_is_read_while_the_server_is_away_and_after_it_is_back(run: Foll
 
 @dataclass(frozen=True)
 class Quiet:
-    """A site with one row, and one follower that has it."""
+    """A site with one row, and a follower that has it."""
 
     run: Followed
     sender: Sender
@@ -278,7 +278,7 @@ def test_a_follower_that_lacks_a_row_refuses_and_the_server_is_asked(quiet: Quie
         client.point(1.0, 1.0)
         assert client.origin.follower == "near"
         with pytest.raises(QueryError, match=r"row 99 is not merged after 1\.5 s") as refused:
-            client.ask(PointQuery(1.0, 1.0, after=99, wait_s=1.5))  # who says so last is the server
+            client.ask(PointQuery(1.0, 1.0, after=99, wait_s=1.5))  # the server refuses last
         assert refused.value.reason == "after_timeout"
         assert client.info().counters["refused_query_after_timeout"] == 1, f"follower pid {quiet.follower.pid}"
 

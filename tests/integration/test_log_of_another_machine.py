@@ -1,4 +1,4 @@
-"""A log of another machine through real processes: fixes in metres, two wheels, Doppler, a text file without names."""
+"""A foreign machine's log through real processes: fixes in metres, two wheels, Doppler, a headerless file."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def write_log(folder: Path) -> np.ndarray:
     ahead, sideways = SPEED_MPS - 0.2 * turn, 0.5 * turn
     east, north = c * ahead - s * sideways, s * ahead + c * sideways
     speed, course = np.hypot(east, north), np.degrees(np.arctan2(east, north))
-    rows = zip(t[::2] - 0.1, *antenna[::2].T, speed[::2], course[::2], strict=True)  # stamped a tenth of a second early
+    rows = zip(t[::2] - 0.1, *antenna[::2].T, speed[::2], course[::2], strict=True)  # stamped 0.1 s early
     lines = [",".join(f"{value:.4f}" for value in row) for row in rows]
     (folder / "tracker.csv").write_text("t,east,north,speed,course\n" + "\n".join(lines) + "\n")
     (folder / "log.toml").write_text(LOG)

@@ -1,4 +1,4 @@
-"""Mishaps of real processes: Ctrl-C while they load, a terminal that is closed, readers of their output that leave."""
+"""Mishaps of real processes: Ctrl-C while loading, closed terminals, vanished readers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
-# Ctrl-C as numpy or another library is loaded: before its n-th import. Every line would soon end by itself.
+# Ctrl-C before the n-th import. Every command line would soon end by itself.
 IMPORTS = (1, 100, 350)
 LINES = {command.words[0]: command.line({"endpoint": "none"}) for command in reversed(COMMANDS)} | {
     "agent": ["agent", "--spool", "x.db"],
@@ -30,7 +30,7 @@ LINES = {command.words[0]: command.line({"endpoint": "none"}) for command in rev
     "log": ["log", "run", "missing"],
     "router": ["router", "--listen", "none"],
 }
-# One process for all: it has loaded nothing, and each fork begins as the command does.
+# One process without imports, whose forks start like the command.
 FORKS = """
 import os, signal, sys
 import sitegrid.cli
@@ -71,7 +71,7 @@ def test_ctrl_c_while_a_command_loads_ends_it_without_a_word(tmp_path: Path):
         if code in (-signal.SIGINT, INTERRUPTED):
             assert said == "", (left, words)
             interrupted[words[0]] += 1
-        else:  # it needs fewer imports, and has ended by itself
+        else:  # fewer imports: ended by itself
             assert code in (0, 1), (left, words, said)
             assert "Traceback" not in said
     assert min(interrupted.values()) >= 2, interrupted
@@ -145,7 +145,7 @@ def children_of(pid: int) -> list[int]:
 
 @pytest.mark.nightly
 def test_a_recording_outlives_its_terminal(tmp_path: Path):
-    """SIGHUP, and a terminal that takes no word any more: the bar, the result."""
+    """SIGHUP, and a terminal that takes no more output."""
     ours, theirs = os.openpty()
     words = sitegrid("sim", "--record", "logs", "--machines", 1, "--world", "fast", "--seconds", 3000)
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
@@ -154,7 +154,7 @@ def test_a_recording_outlives_its_terminal(tmp_path: Path):
         try:
             os.close(theirs)
             said = b""
-            while said.count(b"recording") < 3:  # drawn again, as something was recorded
+            while said.count(b"recording") < 3:  # redrawn while recording
                 said += os.read(ours, 1000)
             os.close(ours)
             assert sim.wait(PATIENCE_S) == 0

@@ -1,4 +1,4 @@
-"""The notebooks of examples/ run on a site from their first cell to their last, and so does the Python of README."""
+"""The notebooks of examples/ and README's Python run on a site."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ nbclient = pytest.importorskip("nbclient")
 
 @pytest.mark.nightly
 @pytest.mark.processes
-@pytest.mark.filterwarnings("ignore")  # of the kernel's own libraries
+@pytest.mark.filterwarnings("ignore")  # of the kernel's libraries
 @pytest.mark.parametrize("name", [path.name for path in sorted((ROOT / "examples").glob("*.ipynb"))])
 def test_a_notebook_runs_and_was_saved_with_its_answers(hauling: WebSite, name: str, monkeypatch):
     monkeypatch.setenv("SITEGRID_ENDPOINT", hauling.endpoint)

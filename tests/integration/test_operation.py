@@ -1,4 +1,4 @@
-"""Real processes in the hands of an operator: SIGTERM in the worst moments, metrics, doctor, logs, memory."""
+"""Operation of real processes: SIGTERM at bad moments, metrics, doctor, logs, memory."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
-END_S = 25.0  # ten times what it gives itself; what it must not wait for, Zenoh's replies and links, takes 30
+END_S = 25.0  # ten times its own limit; Zenoh's replies and links, which it must not await, take 30
 NOW_NS = 1_767_225_600_000_000_000
 
 
 def end(child: Child) -> None:
-    """Ask it to end; it has to end in peace, whatever it waits for."""
+    """SIGTERM must end it cleanly, whatever it waits for."""
     child.send(signal.SIGTERM)
     assert child.wait(END_S) == 0
 
@@ -50,7 +50,7 @@ def session_of(endpoint: str) -> closing[zenoh.Session]:
 
 
 def drive(n: int, seed: int, first_s: int = 0) -> np.ndarray:
-    """Samples of a machine all over 50 x 50 m, one a second."""
+    """Samples of a machine all over 50 x 50 m, one per second."""
     draw = np.random.default_rng(seed)
     rows = empty(n)
     rows["stamp_ns"] = NOW_NS + (first_s + np.arange(n)) * 10**9
@@ -61,7 +61,7 @@ def drive(n: int, seed: int, first_s: int = 0) -> np.ndarray:
 
 
 class Sender:
-    """Sends batches as fast as they are acknowledged, on a thread, and keeps the last acknowledged sample."""
+    """Sends batches on a thread as fast as acknowledged; keeps the last acknowledged sample."""
 
     def __init__(self, session: zenoh.Session, site: SiteConfig, machine: str, n: int = 200) -> None:
         self.machine, self.watermark = machine, 0
@@ -92,7 +92,7 @@ def committed(store: Path) -> dict[str, int]:
 
 
 def old_rows(store: Path, site: SiteConfig) -> None:
-    """Fill a store with what has to be archived at once."""
+    """Fill a store with rows to be archived at once."""
     with closing(Store(JournalLocation(store), site, ServerConfig(), lambda: NOW_NS)) as opened:
         for i in range(50):
             batch = SampleBatch("old", 7, 1 + 1000 * i, drive(1000, seed=i, first_s=100 * i), site.frame)
@@ -128,7 +128,7 @@ def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: Site
     for cache in store.glob("snapshot-*"):
         cache.unlink()
     text = site.site_file.read_text()
-    site.site_file.write_text(text.replace(f"cell_m = {old.cell_m}", "cell_m = 0.05"))  # slow: many for each sample
+    site.site_file.write_text(text.replace(f"cell_m = {old.cell_m}", "cell_m = 0.05"))  # slow: many cells per sample
     assert load_site(site.site_file).cell_m == 0.05
     site.start_router()
     words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", store)
@@ -140,7 +140,7 @@ def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: Site
 
 
 def wait_for_handlers(child: Child) -> None:
-    """Until it catches SIGTERM; before, that ends it at once, with nothing begun."""
+    """Wait until it handles SIGTERM, which ends it at once before."""
 
     def catches() -> bool:
         status = dict(line.split(":", 1) for line in Path(f"/proc/{child.pid}/status").read_text().splitlines())
@@ -199,7 +199,7 @@ def test_an_agent_in_the_middle_of_an_exchange_with_a_dead_server_ends_in_time(s
 
 @contextlib.contextmanager
 def paused(child: Child) -> Iterator[None]:
-    """As a process that hangs: its sockets stay open, nothing is read."""
+    """Simulate a hang: sockets stay open, nothing is read."""
     child.send(signal.SIGSTOP)
     try:
         yield
@@ -231,7 +231,7 @@ def test_a_query_that_follows_ends_in_time_also_while_the_server_hangs(site: Sit
 
 
 def scrape(url: str) -> dict[str, float]:
-    """Metrics by name, of the machines' those of the only one."""
+    """Metrics by name; the only machine's for machine metrics."""
     with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:
         families = text_string_to_metric_families(answer.read().decode())
     return {sample.name: sample.value for family in families for sample in family.samples}
@@ -283,7 +283,7 @@ def run_doctor(*words: object) -> tuple[int, dict[str, dict[str, str]]]:
 
 @pytest.fixture
 def guarded(tmp_path: Path, children: Children) -> Callable[..., tuple[int, dict[str, dict[str, str]]]]:
-    """A site with keys; asks the doctor with the keys of one name."""
+    """A site with keys; runs the doctor with one name's keys."""
     pytest.importorskip("cryptography")
     folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
     assert said("keys", "init", "--dir", folder).code == 0

@@ -1,4 +1,4 @@
-"""The live page in a browser: what people click, on a running site. Needs Chromium (Debian: `chromium`)."""
+"""The live page in a browser on a running site. Needs Chromium (Debian: `chromium`)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def tab(browser, web: WebSite) -> Iterator[Tab]:
 
 
 def known_place(web: WebSite) -> tuple[float, float]:
-    """The centre of a well known cell."""
+    """Centre of a well known cell."""
     region = web.client.region((0, 0, 300, 300), ["resistance", "visits", "confidence"])
     sure = np.nan_to_num(region["visits"]) * np.nan_to_num(region["confidence"])
     row, column = np.unravel_index(int(sure.argmax()), sure.shape)
@@ -150,7 +150,7 @@ def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab, web: Web
     tab.page.keyboard.press("c")
     tab.until("sitegrid.times.mode === 'beside' && sitegrid.times.otherMap !== null")
     assert tab.page.locator("#sides").inner_text().endswith("now")
-    tab.page.mouse.move(640, 300)  # the line is in the middle
+    tab.page.mouse.move(640, 300)  # the line is central
     tab.page.mouse.down()
     tab.page.mouse.move(900, 300, steps=4)
     tab.page.mouse.up()
@@ -340,9 +340,9 @@ def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
 
 
 class Sweeper:
-    """A machine that drives lanes over an area, once an hour; one half of it is paved between.
+    """A machine that sweeps an area once an hour; half of it is paved in between.
 
-    blind_hours: it measures no resistance before them.
+    blind_hours: without resistance until then.
     """
 
     name = "sweeper"
@@ -351,7 +351,7 @@ class Sweeper:
         self._seq, self._blind_hours = 0, blind_hours
 
     def drive(self, from_s: float, frame: str) -> bytes:
-        """The batch of an hour, which begins 900 times as late as the others' seconds."""
+        """The batch of an hour, which starts 900 times later than the others' seconds."""
         hour = from_s / BATCH_S
         x, y = np.meshgrid(np.arange(20.5, 80), np.arange(20.5, 50))
         rows = empty(x.size)
@@ -411,6 +411,6 @@ def test_changed_ground_is_outlined_and_says_what_it_was(browser, tmp_path: Path
         shown = tab.js(f"sitegrid.times.otherMap.at({(west + east) // 2}, {(south + north) // 2}, 'resistance')")
         assert shown == pytest.approx(0.04, rel=0.1), "the map of before the change"
         tab.js(f"sitegrid.times.go({START_NS + 2 * 3600 * 10**9})")
-        tab.until("document.querySelector('#panel .big b').textContent === '4.0 %'")  # the panel is of the time shown
+        tab.until("document.querySelector('#panel .big b').textContent === '4.0 %'")  # the panel is of the shown time
         assert tab.complaints == []
         tab.close()

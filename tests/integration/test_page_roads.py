@@ -1,4 +1,4 @@
-"""The live page's worklist and routes in a browser, on a running site. Needs Chromium (Debian: `chromium`)."""
+"""The live page's worklist and routes in a browser on a running site. Needs Chromium (Debian: `chromium`)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def tab(browser, web: WebSite) -> Iterator[Tab]:
 
 
 def opened(tab: Tab, key: str = "w") -> Any:
-    """The panel of a key, once it has its answer."""
+    """A key's panel once it has its answer."""
     tab.page.keyboard.press(key)
     tab.until(f"sitegrid.panel.name !== null && {QUIET}")
     return tab.page.locator("#panel")
@@ -80,7 +80,7 @@ def answer_of(web: WebSite) -> dict[str, Any]:
 
 
 def answers(tab: Tab, resource: str, body: Any, status: int = 200) -> None:
-    """From now on, in place of the server."""
+    """Answer in place of the server."""
     tab.page.route(f"**/{resource}?**", lambda route: route.fulfill(status=status, json=body))
 
 
@@ -221,7 +221,7 @@ def test_the_cheapest_line_between_two_clicks_is_beside_the_straight_one(tab: Ta
     tab.until(f"sitegrid.route.cost === 'time' && {QUIET} && sitegrid.route.answer !== null")
     quickest = web.client.ask(WayQuery(*ends, "time", machine=MACHINES["truck"]))
     assert tab.js("sitegrid.route.answer.totals.time_s") == pytest.approx(quickest.totals.time_s, rel=1e-6)
-    tab.page.mouse.click(*tab.pixel_of(60, 10))  # a third click begins anew
+    tab.page.mouse.click(*tab.pixel_of(60, 10))  # a third click starts anew
     tab.until(f"sitegrid.route.places.length === 1 && sitegrid.route.answer === null && {QUIET}")
     set_places(tab, (130, 10))
     assert "The straight line costs the same." in panel.inner_text()
@@ -237,7 +237,7 @@ def test_a_link_opens_the_same_drive(tab: Tab, browser, cheapest: bool):
         tab.until(f"sitegrid.route.cost === 'time' && {QUIET}")
     tab.page.locator("#machine").select_option("empty_truck")
     set_places(tab, (20, 10), (120, 10))
-    tab.until("new URLSearchParams(location.search).get('line')?.includes(';')")  # the address follows, at rest
+    tab.until("new URLSearchParams(location.search).get('line')?.includes(';')")  # the address follows at rest
     other = Tab(browser, tab.page.url).loaded()
     other.until(f"sitegrid.panel.name === 'route' && {QUIET} && sitegrid.route.answer !== null")
     assert other.page.locator("#panel .totals").inner_text() == panel.locator(".totals").inner_text()
@@ -267,7 +267,7 @@ def test_names_from_elsewhere_are_text_and_never_markup(tab: Tab, web: WebSite):
     assert evil in panel.locator(".failed").inner_text()
     assert tab.js("window.hacked") is None
     assert tab.js("document.querySelectorAll('#panel img, #panel script').length") == 0
-    tab.complaints[:] = [text for text in tab.complaints if "400" not in text]  # the browser's own word on the refusal
+    tab.complaints[:] = [text for text in tab.complaints if "400" not in text]  # the browser's own message
 
 
 @pytest.mark.parametrize(
@@ -318,7 +318,7 @@ def test_a_slow_answer_holds_nothing_up_and_a_late_one_is_dropped(tab: Tab):
     tab.page.mouse.click(*tab.pixel_of(140, 10))
     tab.until(f"{QUIET} && sitegrid.route.answer !== null && sitegrid.route.places.length === 3")
     assert held
-    with contextlib.suppress(Exception):  # the page has dropped the question already
+    with contextlib.suppress(Exception):  # the page already dropped the query
         held[0].continue_()
     tab.drawn()
     assert tab.js("sitegrid.route.answer.line.length") == 3

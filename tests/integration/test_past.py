@@ -1,4 +1,4 @@
-"""Checkpoints of real servers: killed while one is written, asked right after a machine is distrusted."""
+"""Checkpoints of real servers: killed during writing, queried right after a distrust."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Sent = list[tuple[str, Table]]
 
 
 def filled_journal(folder: Path) -> Sent:
-    """Two hours of ten machines' work as a journal; a quarter of an hour of each came in last."""
+    """A journal of two hours of ten machines; 15 minutes of each arrived last."""
     sent = list(islice(batches(), samples_of(HOURS) // BATCH))
     late = [i for i, (_, rows) in enumerate(sent) if 0.5 < (rows["stamp_ns"][0] - START_NS) / HOUR_NS % 1 < 0.75]
     sent = [each for i, each in enumerate(sent) if i not in set(late)] + [sent[i] for i in late]
@@ -57,7 +57,7 @@ def filled_journal(folder: Path) -> Sent:
 
 
 def is_fold_from_the_start(client: Client, sent: Sent, stamp_ns: int, without: str = "") -> bool:
-    """Whether a server's map as of a time is what a grid makes of these samples."""
+    """Whether a server's past map equals a fold of these samples."""
     grid = Grid(SITE.cell_m, CONFIG.fold)
     for name, rows in sent:
         if name != without:
@@ -108,9 +108,9 @@ def test_the_past_of_a_server_killed_in_mid_checkpoint_and_after_a_distrust(tmp_
             assert client.info().checkpoints.passed_over == 0
 
             assert not client.distrust(BAD, "its scale is broken").trusted
-            for stamp_ns in (late_ns, between_ns):  # those that there are do not count
+            for stamp_ns in (late_ns, between_ns):  # existing checkpoints do not apply
                 assert is_fold_from_the_start(client, sent, stamp_ns, without=BAD)
-            made(client, 2)  # without it
+            made(client, 2)  # without the machine
             for stamp_ns in (late_ns, between_ns):
                 assert is_fold_from_the_start(client, sent, stamp_ns, without=BAD)
             assert client.trust(BAD, "repaired").trusted

@@ -1,6 +1,6 @@
-"""Clients by another hand (`tests/clients/`) against real processes that are killed: 0 lost, 0 double.
+"""Independent clients (`tests/clients/`) against real killed processes: 0 lost, 0 double.
 
-The count is their own: plain SQL on the journal, as docs/operation.md describes it.
+Counted by plain SQL on the journal, as described in docs/operation.md.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.processes
 SENDER = ROOT / "tests" / "clients" / "plain_sender.py"
 SITE, SAMPLES, KILLS = "lot", 1200, 5
 MACHINES = ("digger-1", "digger-2")
-# And what is not stated: no calibration, mass NaN, no aid of lanes, fuel NaN.
+# Unstated: no calibration, mass NaN, no lane aid, fuel NaN.
 SAMPLE = struct.Struct(f"{plain_sender.ROW}fffff")
 HEAD = struct.Struct("<qqQqB")
 
@@ -51,7 +51,7 @@ def test_the_plain_clients_know_nothing_of_this_project():
 
 
 def test_the_plain_sender_writes_a_batch_as_the_golden_file_has_it():
-    golden = msgpack.unpackb((GOLDEN / "batch_older.bin").read_bytes())  # it has no calibration of its own
+    golden = msgpack.unpackb((GOLDEN / "batch_older.bin").read_bytes())  # without own calibration
     run = plain_sender.Run(golden["spool_id"], 0, 0, golden.get("store", ""))
     sender = plain_sender.Sender(None, "", golden["machine"], golden["frame"], None, None)  # type: ignore[arg-type]
     columns = [struct.unpack(f"<{golden['n']}{kind}", golden["cols"][name]) for name, kind in plain_sender.COLUMNS]
@@ -61,7 +61,7 @@ def test_the_plain_sender_writes_a_batch_as_the_golden_file_has_it():
 
 
 class Lot:
-    """Router, map server and plain senders, each killed and started again at will."""
+    """Router, map server and plain senders, killed and restarted at will."""
 
     def __init__(self, folder: Path, children: Children) -> None:
         self.folder, self.endpoint, self._children = folder, free_endpoint(), children
@@ -110,7 +110,7 @@ class Lot:
 
 
 def journal(store: Path) -> Counter[tuple[str, int, int, int]]:
-    """Every sample of the journal, by machine, run, number and stamp: how often it is there."""
+    """Journalled samples by machine, run, number and stamp, with repetitions."""
     counts: Counter[tuple[str, int, int, int]] = Counter()
     with closing(sqlite3.connect(store / "journal.db")) as db:
         for number, record in db.execute("SELECT row, record FROM journal ORDER BY row"):
@@ -129,7 +129,7 @@ def journal(store: Path) -> Counter[tuple[str, int, int, int]]:
 
 
 def recorded(path: Path, machine: str) -> tuple[set[tuple[str, int, int]], int]:
-    """Machine, run and number of all samples that a plain sender has recorded and not quarantined; how many it has."""
+    """Machine, run and number of recorded, unquarantined samples of a plain sender; and the total."""
     with closing(sqlite3.connect(path)) as db:
         runs = {place: (int(run), newest) for place, run, newest in db.execute("SELECT place, id, newest FROM run")}
         bad = {(runs[place][0], seq) for place, seq in db.execute("SELECT place, seq FROM quarantine")}
@@ -175,19 +175,19 @@ def test_a_plain_sender_loses_and_doubles_nothing_while_everything_is_killed(tmp
 
 
 def progress(folder: Path) -> list[Any]:
-    """What the senders' spools have had acknowledged."""
+    """Acknowledged progress in the senders' spools."""
     marks: list[Any] = []
     for name in MACHINES:
         try:
             with closing(sqlite3.connect(f"file:{folder / name}.db?mode=ro", uri=True)) as db:
                 marks.append(db.execute("SELECT sum(acknowledged), count(*) FROM run").fetchone())
-        except sqlite3.OperationalError:  # not made yet
+        except sqlite3.OperationalError:  # not created yet
             marks.append(None)
     return marks
 
 
 def compare_answers(client: Any) -> None:
-    """The plain asker reads what the client of this project reads."""
+    """Plain asker and client read the same."""
     session = client.session
     info = plain_asker.ask(session, SITE, "info")["info"]
     assert info["machines"].keys() == {*MACHINES}

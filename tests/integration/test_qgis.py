@@ -1,4 +1,4 @@
-"""QGIS reads what is exported, and an empty layer of the web server; skipped where Debian's `python3-qgis` is not."""
+"""QGIS reads exports and an empty web layer; skipped without Debian's `python3-qgis`."""
 
 from __future__ import annotations
 

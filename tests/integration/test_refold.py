@@ -1,4 +1,4 @@
-"""Decisions about machines in real processes: work goes on meanwhile; kills, ends and full disks at the worst time."""
+"""Decisions about machines in real processes: continued work, kills, ends and full disks at bad moments."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from tests.unit.mapserver.data import same
 
 pytestmark = pytest.mark.processes
 
-ROWS, FEW_ROWS = 3000, 500  # of 100 samples: a fold of the many takes a good part of a second
+ROWS, FEW_ROWS = 3000, 500  # of 100 samples: the larger fold takes a good part of a second
 
 
 @pytest.fixture
 def site(site: SiteRun, request: pytest.FixtureRequest) -> SiteRun:
-    """A site whose store has samples of ten machines, and no snapshot."""
+    """A site with samples of ten machines and no snapshot."""
     (site.folder / "server.toml").write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
     rows = getattr(request, "param", ROWS)
     write_store(site.folder / "store", load_site(site.site_file), rows, tail_rows=rows)
@@ -60,7 +60,7 @@ def fold_without(site: SiteRun, machines: set[str]) -> Grid:
 
 @contextmanager
 def repeated(ask: Callable[[], object]) -> Iterator[list[object]]:
-    """Ask again and again on a thread; gives the answers so far."""
+    """Ask repeatedly on a thread; yields the answers so far."""
     answers, ended = list[object](), threading.Event()
 
     def repeat() -> None:
@@ -107,7 +107,7 @@ def test_batches_and_queries_are_answered_during_a_refold_and_the_map_is_that_of
 
 
 def given(client: Client, machine: str, wait_s: float = 0.0) -> None:
-    """Give a command; whether the map follows in time or not, it is answered."""
+    """Give a command; it is answered whether or not the map follows in time."""
     try:
         client.distrust(machine, "a test", wait_s=wait_s)
     except QueryError as error:
@@ -135,7 +135,7 @@ def test_a_server_that_folds_again_ends_in_time(site: SiteRun):
 
 @contextmanager
 def full_disk(server: Child) -> Iterator[None]:
-    """No file of the process can grow or be begun."""
+    """No file of the process can grow or be created."""
     before = resource.prlimit(server.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(server.pid, resource.RLIMIT_FSIZE, (0, before[1]))
     try:

@@ -1,4 +1,4 @@
-"""Nobody is let in: real processes with mutual TLS on loopback, and everyone who should not get through."""
+"""Access control: real processes with mutual TLS on loopback, and everyone who must not get through."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Guarded:
         return closing(open_session(self.settings(name)))
 
     def drive(self, spool: Path, seconds: float) -> tuple[Child, Child]:
-        """The agent of a machine, and the simulator that moves it."""
+        """A machine's agent and simulator."""
         files = ("--spool", spool, "--site-file", self.site_file, "--config", self.configs[0])
         agent = self.children.start("agent", "agent", *self.network("loader-1"), *files, "--json")
         agent.expect("ready", PATIENCE_S)
@@ -95,13 +95,13 @@ class Guarded:
         return agent, self.children.start("sim", "sim", *self.network("sim"), *words)
 
     def still_works(self) -> str:
-        """Raises unless a visitor still reads the map; returns whom a failed assertion is about."""
+        """Raises unless a visitor can still read the map; returns a message for assertions."""
         with connect(self.endpoint, SITE, keys=self.keys / "guest") as client:
             client.info()
         return f"router pid {self.router.pid}, server pid {self.server.pid}"
 
     def batch(self, machine: str) -> bytes:
-        """One sample of a machine, as its agent sends it, in a spool of its own."""
+        """One sample of a machine in its own spool, as an agent would send it."""
         rows = np.ones(1, SAMPLE_DTYPE)
         rows["cov_xy_m2"] = rows["applied_zero"] = rows["applied_scale"] = 0.0
         return encode_batch(SampleBatch(machine, time.time_ns(), 1, rows, load_site(self.site_file).frame))
@@ -124,13 +124,13 @@ def acknowledged(session: zenoh.Session, key: str, batch: bytes) -> list[bool]:
 
 
 def is_taken(site: Guarded, session: zenoh.Session, machine: str) -> bool:
-    """Whether a batch of a machine is acknowledged, once."""
+    """Whether a machine's batch is acknowledged exactly once."""
     return acknowledged(session, keys.ingest(SITE, machine), site.batch(machine)) == [True]
 
 
 @contextlib.contextmanager
 def listening(session: zenoh.Session, key: str) -> Iterator[list[bytes]]:
-    """What arrives of a key; the router knows of it once a question behind it is answered."""
+    """Arrivals on a key; the router knows of it once a later query is answered."""
     received: list[bytes] = []
     subscriber = session.declare_subscriber(key, lambda sample: received.append(sample.payload.to_bytes()))
     assert answers(session, keys.map_query(SITE, "info"))
@@ -139,7 +139,7 @@ def listening(session: zenoh.Session, key: str) -> Iterator[list[bytes]]:
 
 
 def put_until(received: list[bytes], payload: bytes, put: Callable[[], object]) -> None:
-    """Put again and again until it arrives: a router's knowledge of listeners spreads by itself."""
+    """Put repeatedly until arrival: routers learn of listeners with a delay."""
 
     def arrived() -> bool:
         put()
@@ -154,7 +154,7 @@ def put_until(received: list[bytes], payload: bytes, put: Callable[[], object]) 
 def test_a_machine_gets_its_acknowledgements_from_the_map_server(guarded: Guarded):
     with guarded.session("loader-1") as session, connect(guarded.endpoint, keys=guarded.keys / "loader-1") as client:
         before = client.info().journalled
-        for _ in range(200):  # faster than any rate limit: these never fall under one
+        for _ in range(200):  # acknowledgements have no rate limit
             assert is_taken(guarded, session, "loader-1")
         assert client.info(after=before + 200).journalled == before + 200
 
@@ -209,7 +209,7 @@ def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
         with guarded.session("boss") as boss, listening(boss, keys.poses_all(SITE)) as received:
             guest.put(keys.pose(SITE, "loader-1"), b"forged")
             guest.put(keys.pose(SITE, "guest"), b"forged")
-            assert answers(guest, keys.map_query(SITE, "info"))  # what was put before it has been judged
+            assert answers(guest, keys.map_query(SITE, "info"))  # earlier puts have been judged
             with guarded.session("loader-1") as loader:
                 put_until(received, b"own", lambda: loader.put(keys.pose(SITE, "loader-1"), b"own"))
             assert set(received) == {b"own"}
@@ -221,7 +221,7 @@ def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
 def with_certificate(
     guarded: Guarded, folder: Path, authority: Any, days: float, name: str = "loader-1"
 ) -> Credentials:
-    """The keys of a machine that is let in, with a certificate of another making."""
+    """Keys of an admitted machine with a certificate from elsewhere."""
     now = datetime.now(UTC)
     pair = certificates.issue(authority, name, now - 2 * DAY, now + days * DAY)
     shutil.copytree(guarded.keys / "loader-1", folder)
@@ -324,7 +324,7 @@ def test_a_machine_writes_only_under_its_own_name(guarded: Guarded, mode: str):
 
 @contextlib.contextmanager
 def as_machine(guarded: Guarded, name: str, mode: str) -> Iterator[zenoh.Session]:
-    """The session of a machine, or of one that comes as a router to be told more."""
+    """A machine's session, possibly as a router to receive more."""
     settings = zenoh.Config()
     tls = load_credentials(guarded.keys / name).tls(listens=False)
     values = {"mode": mode, "connect/endpoints": [guarded.endpoint], "listen/endpoints": []}
@@ -337,7 +337,7 @@ def as_machine(guarded: Guarded, name: str, mode: str) -> Iterator[zenoh.Session
 
 CORRECTIONS = keys.corrections(SITE, "base-1")
 POSE, OTHERS_POSE = keys.pose(SITE, "loader-1"), keys.pose(SITE, "loader-2")
-# Who listens to what; who forges it, under which keys; and who may say it, under which.
+# Listener; forger and keys; legitimate sender and key.
 FORGED = {
     "pose": (
         ("guest", keys.poses_all(SITE)),
@@ -362,7 +362,7 @@ def test_what_is_forged_reaches_nobody(guarded: Guarded, what: str):
         for name, forged in forgers.items():
             for each in forged:
                 sessions[name].put(each, b"forged")
-            answers(sessions[name], keys.map_query(SITE, "info"))  # what was put before it has been judged
+            answers(sessions[name], keys.map_query(SITE, "info"))  # earlier puts have been judged
         put_until(received, b"true", lambda: sessions[owner].put(own, b"true"))
         assert set(received) == {b"true"}, guarded.still_works()
 
@@ -432,7 +432,7 @@ def test_oversize_payloads_stay_at_the_router(guarded: Guarded):
             def put() -> None:
                 loader.put(keys.pose(SITE, "loader-1"), huge)
                 loader.put(keys.health(SITE, "loader-1"), huge)
-                time.sleep(0.03)  # beyond the rate limit, which counts what is too large
+                time.sleep(0.03)  # beyond the rate limit, which counts oversized messages
                 loader.put(keys.pose(SITE, "loader-1"), b"small")
 
             put_until(received, b"small", put)
@@ -454,7 +454,7 @@ def test_a_flood_of_poses_is_thinned_out(guarded: Guarded):
 
 @pytest.mark.nightly
 def test_connections_that_say_nothing_delay_no_link(guarded: Guarded, children: Forks):
-    """At a router of their own: as they end, each pauses its listener for 0.1 s, so 150 keep everybody out for 15 s."""
+    """At a separate router: each closed connection pauses its listener for 0.1 s, 150 block it for 15 s."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     router = children.start("router", "router", "--keys", guarded.keys, "--listen", endpoint)
     router.expect("ready", PATIENCE_S)
@@ -464,7 +464,7 @@ def test_connections_that_say_nothing_delay_no_link(guarded: Guarded, children: 
         with closing(open_session(dataclasses.replace(guarded.settings("guest"), endpoint=endpoint))):
             for one in silent:
                 one.setblocking(False)
-                with pytest.raises(BlockingIOError):  # no end of it was waited for: the router still has all of them
+                with pytest.raises(BlockingIOError):  # the router still holds all of them
                     one.recv(1)
         assert router.code is None
 

@@ -1,4 +1,4 @@
-"""The main job, through real processes: machines drive, one site grid grows, whoever is killed meanwhile."""
+"""The main job in real processes: machines drive, one grid grows, whoever is killed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.processes
 
 @dataclass(frozen=True)
 class Kill:
-    """One in mid-run: process ids and what was merged, before it and after the victim was started again."""
+    """A kill: process ids and merged samples, before it and after the restart."""
 
     pids: tuple[int, int]
     merged: tuple[int, int]
@@ -38,7 +38,7 @@ class Kill:
 
 @dataclass(frozen=True)
 class Shift:
-    """What was seen of three machines that drive while server, agent and router are killed in turn."""
+    """Three driving machines while server, agent and router are killed in turn."""
 
     pids: list[int]
     during: MapInfo
@@ -75,7 +75,7 @@ def shift(tmp_path_factory: pytest.TempPathFactory) -> Shift:
 
 
 def drive_on(client: Client, run: SiteRun) -> None:
-    """Until all machines hear the simulator again: that it ends it says once."""
+    """Wait until all machines hear the simulator, which announces its end only once."""
     first_ns, newest_ns = dict[str, int](), dict[str, int]()
 
     def note(sample: zenoh.Sample) -> None:
@@ -92,13 +92,13 @@ def drive_on(client: Client, run: SiteRun) -> None:
 
 
 def killed(client: Client, victim: Child, start: Callable[[], Child], machine: str = "") -> Kill:
-    """Kill a process and start it again; samples, of one machine where its agent was killed, come in as before."""
+    """Kill and restart a process; samples continue, of `machine` if its agent was killed."""
 
     def merged() -> int:
         info = client.info()
         if not machine:
             return info.samples_merged
-        return info.machines[machine].samples if machine in info.machines else 0  # it may be the last to have samples
+        return info.machines[machine].samples if machine in info.machines else 0  # it may be the last with samples
 
     before = merged()
     kill(victim)

@@ -1,4 +1,4 @@
-"""The soak in short; all of it is `make soak`."""
+"""The soak in short; in full: `make soak`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A second server takes over, as processes: the whole of it by `python -m tests.takeover --count 200`."""
+"""Take-over by a second server as processes; in full: `python -m tests.takeover --count 200`."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_a_server_goes_on_at_the_promoted_replica_when_its_database_is_killed(tm
         epoch, began_s = site.epoch(), time.time()
         primary.stop(signal.SIGKILL)
         replica.promote()
-        replica.sql("ALTER SYSTEM RESET synchronous_standby_names")  # alone from now on: a person says so
+        replica.sql("ALTER SYSTEM RESET synchronous_standby_names")  # alone by a person's decision
         replica.sql("SELECT pg_reload_conf()")
         took_s = site.wait_for_acknowledgements(beyond=epoch) - began_s
         site.wait_for_acknowledgements(20)
@@ -74,7 +74,7 @@ def test_a_server_goes_on_at_the_promoted_replica_when_its_database_is_killed(tm
 
 @pytest.mark.nightly
 def test_of_two_servers_at_a_promoted_replica_and_at_the_old_primary_the_old_one_ends(tmp_path: Path) -> None:
-    """Nobody turned the old primary off, and it waits for no replica: both databases take commits."""
+    """The old primary is still on and waits for no replica: both databases take commits."""
     with server.cluster() as primary, Children(tmp_path) as children:
         database = primary.new_database()
         with server.replica(primary, "b") as replica:

@@ -1,4 +1,4 @@
-"""A program watches the map while server and router are killed, and ends with the bits of the region."""
+"""A program watches the map while server and router are killed; the bits finally agree."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TEN_MINUTES_S = 600
 
 
 class Watched:
-    """What a program has seen, kept by a thread of its own."""
+    """What a program saw, on its own thread."""
 
     def __init__(self, site: WebSite, children: Forks) -> None:
         self.bounds = Bounds(-SIDE_M, -SIDE_M, SIDE_M, SIDE_M)

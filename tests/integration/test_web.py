@@ -1,4 +1,4 @@
-"""The map over HTTP: the same numbers as the client's, and clear refusals; every process is a real one."""
+"""The map over HTTP: the client's numbers, and clear refusals; real processes."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_larger_cells_and_outlines_are_the_clients(web: WebSite):
     answer = web.get("region", asked).json
     assert (answer["cell_m"], answer["x_m"]) == (5.0, region.x_m.tolist())
     assert np.array_equal(np.array(answer["layers"]["resistance"], np.float32), region["resistance"], equal_nan=True)
-    # what is too much as text in cells of the map is little in larger ones
+    # too much text in map cells is little in coarse ones
     wide = {"bounds": "0,0,900,900", "layers": "visits"}
     refused = web.get("region", wide)
     assert (refused.status, refused.json["reason"]) == (413, "too_large")
@@ -184,8 +184,8 @@ def test_what_is_no_question_is_refused(web: WebSite):
 
 
 CHUNKED, SECOND = "Transfer-Encoding: chunked", "0\r\n\r\nGET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
-LOST = f"/api/v1/sites/{NAME}/xyz/value/visits/{'9' * 4400}/0/0.png"  # a number that nobody counts to
-RAW = [  # a request and its headers -> the status of its one answer, before the connection ends
+LOST = f"/api/v1/sites/{NAME}/xyz/value/visits/{'9' * 4400}/0/0.png"  # an absurdly long number
+RAW = [  # request and headers -> status of its only answer, before the connection ends
     ("POST / localhost", ["Content-Length: 6", CHUNKED], 400),  # SECOND is in its body, or behind it
     ("GET / localhost", [CHUNKED, "Content-Length: 0"], 400),
     ("POST / localhost", ["Content-Length: 5", "Content-Length: 6"], 400),
@@ -201,7 +201,7 @@ RAW = [  # a request and its headers -> the status of its one answer, before the
     ("GET / localhost", ["Origin: http://[", "Connection: close"], 403),
     (f"GET {LOST} localhost", ["Connection: close"], 414),
 ]
-FRAMES = {  # WebSocket frames, masked with zeros -> how the connection is closed
+FRAMES = {  # WebSocket frames, masked with zeros -> close code
     "bytes": (b"\x82\x81\0\0\0\0x", 1007),
     "no UTF-8": (b"\x81\x82\0\0\0\0\xff\xfe", 1007),
     "infinite": (b'\x81\x96\0\0\0\0{"row":1e999,"fact":1}', 1007),
@@ -250,7 +250,7 @@ def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
     parameters = {"x": x_m, "y": y_m, "layers": "resistance"}
     first = web.get("point", parameters)
     tag = first.headers["etag"]
-    for known in (tag, f"W/{tag}", f'"other", W/{tag} ,"more"', "*"):  # as caches and proxies send it
+    for known in (tag, f"W/{tag}", f'"other", W/{tag} ,"more"', "*"):  # as from caches and proxies
         again = web.get("point", parameters, If_None_Match=known)
         assert (again.status, again.body) == (304, b""), known
     for other in ('"*"', f'{tag[:-1]}0"', "W/*", ""):
@@ -316,7 +316,7 @@ def test_two_sites_stand_behind_one_address(tmp_path: Path):
 
 
 class Page:
-    """A page without a browser. It checks that no tile ever goes back."""
+    """A page without browser; checks that no tile goes back."""
 
     def __init__(self, web: WebSite) -> None:
         self.web, self.socket = web, None
@@ -330,7 +330,7 @@ class Page:
         return self.socket
 
     def take(self, until: tuple[int, int]) -> None:
-        """Take in what comes until the map is of a version, or a later one."""
+        """Receive until the map has at least this version."""
         while self.version < until or not self.frames:
             data = self.socket.recv(timeout=PATIENCE_S)
             if isinstance(data, bytes):
@@ -352,7 +352,7 @@ class Page:
 
 
 def newest(web: WebSite) -> tuple[dict[tuple[int, int], tuple[int, bytes]], tuple[int, int]]:
-    """A fresh snapshot, and its version."""
+    """A fresh snapshot and its version."""
     frame = Frame.read(web.get("tiles").body)
     return frame.tiles, frame.version
 
@@ -369,7 +369,7 @@ def test_pages_that_are_fast_slow_or_asleep_end_with_the_map_as_it_is(web: WebSi
         tiles, version = newest(web)
         last = max((tile.row for tile in web.client.ask(TilesQuery()).tiles), default=0)
         fast.take((last, 0))
-        slow.take((last, 0))  # it slept through four drives, and gets them as one or two maps
+        slow.take((last, 0))  # asleep for four drives, received as one or two maps
         assert fast.tiles == slow.tiles == tiles
         assert slow.frames < frames_of_fast
         assert version >= (last, 0)

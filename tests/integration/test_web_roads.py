@@ -1,4 +1,4 @@
-"""Roads, worklist, routes and cheapest lines over HTTP: the client's own numbers; every process is a real one."""
+"""Roads, worklist, routes and cheapest lines over HTTP: the client's numbers; real processes."""
 
 from __future__ import annotations
 

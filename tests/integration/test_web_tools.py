@@ -1,4 +1,4 @@
-"""Foreign tools at the web server: GDAL reads tiles and features, as QGIS does, and schemathesis looks for faults."""
+"""Foreign tools at the web server: GDAL reads tiles and features like QGIS; schemathesis searches faults."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def projection(web: WebSite) -> Projection:
 
 
 def driven(client: Client, layer: str) -> AnyArray:
-    """Centres (n, 2) of all cells with a value."""
+    """Centres (n, 2) of cells with a value."""
     region = client.region((0, 0, 300, 300), [layer])
     rows, columns = np.nonzero(~np.isnan(region[layer]))
     return np.column_stack([region.x_m[columns], region.y_m[rows]])
@@ -89,7 +89,7 @@ def test_gdal_reads_the_right_value_at_the_right_place_also_over_a_border(web: W
 
 
 def _border(tiles: rasterio.DatasetReader, places: AnyArray, projection: Projection) -> tuple[int, int]:
-    """The corner of four tiles that lies nearest to where somebody drove: column and row of its pixel."""
+    """Corner of four tiles nearest to driven ground: column and row of its pixel."""
     geodetic = [projection.to_geodetic(x, y) for x, y in places]
     east, north = transform("EPSG:4326", "EPSG:3857", [g[1] for g in geodetic], [g[0] for g in geodetic])
     columns, rows = ~tiles.transform @ (np.array(east), np.array(north))
@@ -102,7 +102,7 @@ def test_gdal_shows_nothing_where_nobody_drove(web: WebSite):
     table = web.get("xyz/resistance.json", {"kind": "value"}).json
     with rasterio.open(TMS.format(url=table["tiles"][0].replace("{", "${"), zoom=ZOOM)) as tiles:
         assert not tiles.read(window=Window(0, 0, 20, 20)).any()
-    for kind, bands in (("colour", 4), ("value", 3)):  # as those of tiles that show something
+    for kind, bands in (("colour", 4), ("value", 3)):  # like tiles with content
         with rasterio.open(io.BytesIO(web.get(f"xyz/{kind}/resistance/12/0/0.png").body)) as png:
             shown = png.read(4) if kind == "colour" else png.read()
             assert (png.count, shown.any()) == (bands, False)
@@ -117,7 +117,7 @@ def test_tilejson_is_valid_and_its_template_leads_to_tiles(web: WebSite, project
         assert -90 <= south < north <= 90
         assert 0 <= table["minzoom"] <= table["maxzoom"] <= 30
         lat, lon, _ = projection.to_geodetic(*driven(web.client, "resistance")[0])
-        for z in (0, 7, 10, 13, 16):  # the site is one pixel, or some
+        for z in (0, 7, 10, 13, 16):  # the site is one pixel, or a few
             x, y = int((lon + 180) / 360 * 2**z), int((1 - np.arcsinh(np.tan(np.radians(lat))) / np.pi) / 2 * 2**z)
             with rasterio.open(io.BytesIO(web.get(f"xyz/{kind}/resistance_class/{z}/{x}/{y}.png").body)) as tile:
                 assert tile.read(4 if kind == "colour" else None).any(), z
@@ -179,7 +179,7 @@ def test_text_is_deflated_for_who_takes_it_and_tiles_are_not_deflated_twice(web:
 
 @pytest.mark.nightly
 def test_a_fuzzer_that_reads_the_description_makes_nothing_fail(web: WebSite, tmp_path: Path):
-    """Questions right and wrong, drawn from the API's own description: each answer is one that it promises."""
+    """Right and wrong queries drawn from the API's description: every answer is a promised one."""
     checks = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
     drawn = "--max-time 10 --seed 1 --max-examples 40 --phases coverage,fuzzing --generation-database :memory:"
     options = ["--checks", checks, *drawn.split(), *["--suppress-health-check", "all", "--no-color", "--workers", "1"]]

@@ -1,4 +1,4 @@
-"""A site whose map is on the web: router, map server and web server as processes, machines that drive when told to."""
+"""A site on the web: router, map server and web server as processes; machines drive on demand."""
 
 from __future__ import annotations
 
@@ -27,8 +27,6 @@ NAME = "soak"
 
 @dataclass(frozen=True)
 class Answer:
-    """What the web server answered."""
-
     status: int
     headers: Mapping[str, str]
     body: bytes
@@ -39,13 +37,13 @@ class Answer:
 
 
 class WebSite:
-    """Everything runs from the start; `drive` has the machines work."""
+    """Everything runs from the start; `drive` lets the machines work."""
 
     def __init__(self, folder: Path, children: Children, *words: str | Path, machines: int = 3) -> None:
         self.folder, self.children = folder, children
         self.endpoint = free_endpoint()
         (folder / "site.toml").write_text(SITE_TOML)
-        # What machines of tests measure is what they sent, whenever the solver looks.
+        # Maps depend on sent samples, not on the solver's timing.
         (folder / "server.toml").write_text("[calibration]\nautomatic = false\n")
         self.router = self.start_router()
         self.server = self.start_server()
@@ -79,7 +77,7 @@ class WebSite:
         return urlsplit(self.url).port or 0
 
     def drive(self, seconds: float) -> None:
-        """Have all machines drive on, and their samples acknowledged."""
+        """Drive all machines on until their samples are acknowledged."""
         end_s = self.driven_s + seconds
         while self.driven_s < end_s:
             for machine in self.machines:
@@ -95,7 +93,7 @@ class WebSite:
         return START_NS + round(self.driven_s * 1e9)
 
     def get(self, path: str, parameters: Mapping[str, object] | None = None, **headers: str) -> Answer:
-        """GET a path of the site's API, or any that begins with a slash."""
+        """GET a path of the site's API, or any path with a leading slash."""
         if not path.startswith("/"):
             path = f"/api/v1/sites/{NAME}/{path}"
         query = f"?{urlencode(parameters)}" if parameters else ""
@@ -117,7 +115,7 @@ class WebSite:
 
 @dataclass
 class Frame:
-    """Tiles as a page gets them."""
+    """Tiles as received by a page."""
 
     head: dict[str, Any]
     tiles: dict[tuple[int, int], tuple[int, bytes]]

@@ -1,13 +1,13 @@
-"""`python -m tests.planted`: plants faults in the product, one after the other, and shows which the tests catch.
+"""`python -m tests.planted`: plant faults in the product one by one; shows which ones the tests catch.
 
-    python -m tests.planted run [FOLDER] --out OUT [--common FOLDER]    plant them in a checkout; goes on where it was
-    python -m tests.planted run [FOLDER] --out OUT --survivors OTHER    those alone that survived in another run
-    python -m tests.planted compare BEFORE AFTER                        two of these, side by side
+    python -m tests.planted run [FOLDER] --out OUT [--common FOLDER]    plant them in a checkout; resumes
+    python -m tests.planted run [FOLDER] --out OUT --survivors OTHER    only those that survived another run
+    python -m tests.planted compare BEFORE AFTER                        two runs side by side
 
-60 faults are written by hand (`faults.toml`), 200 drawn by --seed over functions that FOLDER and --common both have.
-One run of the suite with coverage by test says which tests a fault is given to; they stop at the first that fails.
-What survives is given to the tests of `make nightly` that run its lines. --quick does without that run: a fault is
-given to the unit tests of its module's folder, then to those of its package.
+60 faults are written by hand (`faults.toml`), 200 drawn by --seed over functions common to FOLDER and --common. A run
+of the suite with coverage by test selects each fault's tests; they stop at the first failure. Survivors get the tests
+of `make nightly` that run their lines. --quick omits that run: a fault gets the unit tests of its module's folder, then
+of its package.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from tests.paths import ROOT
 from tests.planted.faults import Fault, drawn, written
 from tests.planted.suite import Suite, trial
 
-UNMARKED = ("-m", "not nightly")  # the tests of --quick
+UNMARKED = ("-m", "not nightly")  # tests of --quick
 RESULTS = "results.jsonl"
 NO_PLACE, SURVIVED = "no place", "survived"
-MOST_S = 300.0  # of tests, as long as they took in the run with coverage, that one fault is given to
+MOST_S = 300.0  # of tests per fault, by their duration in the coverage run
 
 
 def run(suite: Suite, faults: Sequence[Fault], processes: int, most_s: float) -> dict[str, dict[str, str]]:
-    """What became of each fault; kept line by line in RESULTS."""
+    """Fate of each fault; kept line by line in RESULTS."""
     suite.folder.mkdir(parents=True, exist_ok=True)
     if not suite.quick:
         suite.measure(processes)
@@ -59,7 +59,7 @@ def run(suite: Suite, faults: Sequence[Fault], processes: int, most_s: float) ->
 
 
 def judged(suite: Suite, fault: Fault, tree: Path, most_s: float) -> dict[str, str]:
-    """Which tier catches a fault, and by which test."""
+    """Tier and test that catch a fault."""
     row = {"name": fault.name, "what": fault.what, "by": ""}
     try:
         tests = suite.tests_of(fault)
@@ -80,13 +80,13 @@ def judged(suite: Suite, fault: Fault, tree: Path, most_s: float) -> dict[str, s
 
 
 def results_of(folder: Path) -> dict[str, dict[str, str]]:
-    """What became of each fault in a run so far, by its name."""
+    """Results of a run so far, by fault."""
     kept = folder / RESULTS
     return {row["name"]: row for row in map(json.loads, kept.read_text().splitlines())} if kept.exists() else {}
 
 
 def compare(before: Path, after: Path) -> tuple[str, int]:
-    """Both columns as a table, and how many faults the first catches and the second does not."""
+    """Both runs as a table, and the number of faults only the first catches."""
     columns = [results_of(folder) for folder in (before, after)]
     both = [
         name
@@ -107,7 +107,7 @@ def compare(before: Path, after: Path) -> tuple[str, int]:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Plant faults, or compare what became of them. Exit code 1: a fault is lost, or survives."""
+    """Plant or compare. Exit code 1: a fault survives, or is no longer caught."""
     parser = argparse.ArgumentParser(prog="python -m tests.planted", description="Plant faults, see which tests catch.")
     what = parser.add_subparsers(required=True, dest="what")
     planting = what.add_parser("run", help="plant faults in a checkout")

@@ -1,7 +1,7 @@
-"""Faults that are planted: by hand from `faults.toml`, and drawn over the syntax trees of functions.
+"""Planted faults: written in `faults.toml`, and drawn from functions' syntax trees.
 
-A fault is found again in any checkout by what it changes, never by its file: a snippet of text, or the syntax of one
-function without its docstring. So the suites of two checkouts are given the same faults.
+A fault is located in any checkout by content, a text snippet or a function's syntax without docstring, never by file.
+So the suites of two checkouts get the same faults.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ OTHER = {
 
 @dataclass(frozen=True)
 class Place:
-    """Where a fault stands in one checkout: its file, the bytes to replace, and the lines of them."""
+    """Place of a fault in a checkout: file, bytes to replace, lines."""
 
     path: Path
     start: int
@@ -51,7 +51,7 @@ class Place:
 
 @dataclass(frozen=True)
 class WrittenFault:
-    """A fault by hand: `old` becomes `new`; `old` stands once in the product. what: one of the kinds of the list."""
+    """A written fault: the unique `old` becomes `new`. what: its kind."""
 
     name: str
     what: str
@@ -59,7 +59,7 @@ class WrittenFault:
     new: str
 
     def place(self, root: Path) -> Place | None:
-        """Where it stands; None where `old` is not there, or more than once."""
+        """Its place; None unless `old` is unique."""
         places = [
             Place(path, at, at + len(old), (_line(text, at), _line(text, at + len(old))), self.new.encode())
             for path in sources(root)
@@ -72,7 +72,7 @@ class WrittenFault:
 
 @dataclass(frozen=True)
 class DrawnFault:
-    """A fault of the syntax tree. function: name and digest of the function's syntax; node: the index of the change."""
+    """A drawn fault. function: name and digest of its syntax; node: index of the change."""
 
     name: str
     what: str
@@ -80,7 +80,7 @@ class DrawnFault:
     node: int
 
     def place(self, root: Path) -> Place | None:
-        """Where it stands; None where the function is another, or there more than once."""
+        """Its place; None unless the function is unchanged and unique."""
         if len(those := _functions(root).get(self.function, [])) != 1:
             return None
         path, function = those[0]
@@ -97,13 +97,13 @@ Fault = WrittenFault | DrawnFault
 
 
 def written() -> list[Fault]:
-    """The faults by hand."""
+    """Faults from the file."""
     table = tomllib.loads(FILE.read_text(encoding="utf-8"))
     return [WrittenFault(name, **entry) for name, entry in table.items()]
 
 
 def drawn(root: Path, other: Path, count: int, seed: int) -> list[Fault]:
-    """Faults of functions that stand once in both checkouts, as many of each package."""
+    """Faults of functions unique in both checkouts, equally many per package."""
     draw, faults = random.Random(seed), list[Fault]()
     ours = {name: those[0] for name, those in _functions(root).items() if len(those) == 1}
     theirs = _functions(other)
@@ -127,27 +127,27 @@ def drawn(root: Path, other: Path, count: int, seed: int) -> list[Fault]:
 
 
 def sources(root: Path) -> Iterator[Path]:
-    """The modules of the product."""
+    """The product's modules."""
     for package in PACKAGES:
         yield from sorted((root / package).rglob("*.py"))
 
 
 def functions(path: Path) -> Iterator[Function]:
-    """All functions and methods of a module, without those inside of others."""
+    """All functions and methods of a module, without nested ones."""
     for node in ast.parse(path.read_bytes()).body:
         inner = node.body if isinstance(node, ast.ClassDef) else [node]
         yield from (each for each in inner if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef))
 
 
 def key(function: Function) -> str:
-    """Name and digest of a function's syntax, without its docstring."""
+    """Name and digest of a function's syntax, without docstring."""
     body = function.body[1:] if ast.get_docstring(function, clean=False) is not None else function.body
     syntax = ast.dump(function.args) + "".join(map(ast.dump, body))
     return f"{function.name} {hashlib.sha256(syntax.encode()).hexdigest()[:16]}"
 
 
 def changes(function: Function) -> Iterator[tuple[ast.expr, str]]:
-    """Expressions of a function and what each may become: another operator, another number, no check, swapped words."""
+    """Expressions of a function and their replacements: operator, number, check, swap."""
     for statement in function.body:
         for node in _walk(statement):
             if isinstance(node, ast.If | ast.While) and not _is_changed(node.test):
@@ -161,7 +161,7 @@ def changes(function: Function) -> Iterator[tuple[ast.expr, str]]:
 
 
 def _changed(node: ast.expr) -> str:
-    """What an expression becomes; empty where nothing of it can change."""
+    """Replacement of an expression, or empty."""
     if isinstance(node, ast.Compare) and len(node.ops) == 1:
         operator = OTHER[type(node.ops[0])]()
         return ast.unparse(ast.Compare(node.left, [operator], node.comparators))
@@ -177,7 +177,7 @@ def _changed(node: ast.expr) -> str:
 
 
 def _walk(node: ast.AST) -> Iterator[ast.AST]:
-    """The nodes below, but those of formatted text: Python 3.11 does not know where they stand."""
+    """Nodes below, except formatted text, which has no positions in Python 3.11."""
     yield node
     for child in ast.iter_child_nodes(node):
         if not isinstance(child, ast.JoinedStr):
@@ -185,13 +185,13 @@ def _walk(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _is_changed(test: ast.expr) -> bool:
-    """Whether the test of an `if` is changed as an expression already."""
+    """Whether an `if` test is already changed as an expression."""
     return bool(_changed(test))
 
 
 @cache
 def _functions(root: Path) -> dict[str, list[tuple[Path, Function]]]:
-    """Functions by their keys, and where they stand."""
+    """Functions with their places, by key."""
     named: dict[str, list[tuple[Path, Function]]] = {}
     for path in sources(root):
         for function in functions(path):

@@ -1,4 +1,4 @@
-"""The suite of a checkout: which tests run which lines, how long they take, and whether they catch a fault."""
+"""Suite of a checkout: tests by line, durations, and whether they catch a fault."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from coverage import CoverageData
 
 from tests.planted.faults import PACKAGES, Fault
 
-LIMIT_S = 1800.0  # of one trial: a suite that runs so long hangs
+LIMIT_S = 1800.0  # of one trial; longer is a hang
 NIGHTLY = "nightly"
-NO_TESTS = 5  # exit code of pytest where none is selected
+NO_TESTS = 5  # pytest's exit code for an empty selection
 
 
 @dataclass(frozen=True)
 class Suite:
-    """The tests of a checkout. folder: of their times and coverage, and of the copies in which faults are planted.
+    """Tests of a checkout. folder: of durations, coverage, and copies with planted faults.
 
-    tests: files and folders of the suite. quick: whether to do without coverage.
+    tests: files and folders. quick: without coverage.
     """
 
     root: Path
@@ -36,16 +36,16 @@ class Suite:
 
     @property
     def coverage_file(self) -> Path:
-        """Which tests ran which lines."""
+        """Tests by line."""
         return self.folder / "coverage.sqlite"
 
     @property
     def times_file(self) -> Path:
-        """How long each test took, and whether it passed."""
+        """Durations and results."""
         return self.folder / "times.xml"
 
     def copy(self, number: int) -> Path:
-        """A copy of the checkout's files, where it is not there yet; later ones with its compiled kernels."""
+        """A copy of the checkout, made on demand; later ones include compiled kernels."""
         copy = self.folder / f"tree-{number}"
         if copy.exists():
             return copy
@@ -58,7 +58,7 @@ class Suite:
         return copy
 
     def measure(self, processes: int) -> None:
-        """Run the whole suite once with coverage by test, where that was not done yet."""
+        """Run the whole suite with coverage by test, unless done."""
         if self.times_file.exists():
             return
         words = [f"--cov={package}" for package in PACKAGES]
@@ -72,7 +72,7 @@ class Suite:
 
     @cached_property
     def seconds(self) -> dict[str, float]:
-        """How long each test takes that passes, by its id, where pytest finds it by that."""
+        """Durations of passing tests by id, if pytest finds them by it."""
         times = {}
         for case in ET.parse(self.times_file).getroot().iter("testcase"):
             if not [child for child in case if child.tag in ("failure", "error", "skipped")]:
@@ -85,7 +85,7 @@ class Suite:
 
     @cached_property
     def nightly(self) -> set[str]:
-        """Ids of the tests that `make nightly` alone runs."""
+        """Ids of tests in `make nightly` only."""
         return self._collected("-m", NIGHTLY)
 
     def _collected(self, *words: str) -> set[str]:
@@ -99,10 +99,10 @@ class Suite:
         return data
 
     def tests_of(self, fault: Fault) -> list[str]:
-        """Tests, or folders, that may catch a fault, the likeliest first; KeyError where it has no place here.
+        """Tests or folders that may catch a fault, likeliest first; KeyError without a place.
 
-        Those that ran its lines. Compiled code and constants leave no trace: those then that ran anything of the
-        module, or stand in the folder of tests that mirrors it.
+        Those that ran its lines. Compiled code and constants leave no trace: then those that ran its module, or its
+        mirroring test folder.
         """
         root = self.copy(0)
         if (place := fault.place(root)) is None:
@@ -122,7 +122,7 @@ class Suite:
 
 
 def trial(tree: Path, fault: Fault, tests: Sequence[str]) -> str:
-    """Which of the tests catches a fault, in a copy of the checkout; empty where none does."""
+    """The test that catches a fault in a copy of the checkout, or empty."""
     place = fault.place(tree)
     assert place is not None
     original, stat = place.path.read_bytes(), place.path.stat()
@@ -141,14 +141,14 @@ def trial(tree: Path, fault: Fault, tests: Sequence[str]) -> str:
 
 
 def _ids(contexts: dict[int, list[str]], lines: Sequence[int] | dict[int, list[str]]) -> set[str]:
-    """Tests whose contexts stand at these lines."""
+    """Tests with contexts on these lines."""
     return {context.partition("|")[0] for line in lines for context in contexts.get(line, []) if context}
 
 
 def _pytest(
     tree: Path, words: Sequence[str], environment: dict[str, str], limit_s: float | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run pytest in a checkout, without writing byte code: a fault must not outlive its trial."""
+    """Run pytest in a checkout without byte code, so that faults do not outlive their trial."""
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:randomly", *words]
     extra = {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1", **environment}
     return subprocess.run(

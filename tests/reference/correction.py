@@ -1,4 +1,4 @@
-"""Corrected samples in numpy, operation by operation: what the kernel has to give, bit for bit."""
+"""Sample correction in numpy, bit-exact reference for the kernel."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from protocol.machine.samples import LIMITS
 
 
 def in_numpy(rows: Table, c: Correction) -> Table:
-    """Samples of one machine without its errors, whenever they were."""
+    """Samples of one machine without its errors."""
     out = rows.copy()
     unit = UNIT_VECTORS[
         (np.floor(rows["heading_rad"].astype(np.float64) * (HEADINGS / (2 * np.pi)) + 0.5)).astype(int) % HEADINGS

@@ -1,4 +1,4 @@
-"""The evidence of a site as its definition says it: sample by sample, cell by cell, without packing or kernels."""
+"""A site's evidence by definition: sample by sample, cell by cell, without packing or kernels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Span = tuple[int, int]  # tier and index
 
 @dataclass
 class CellEvidence:
-    """Evidence of one cell over one span of time."""
+    """Evidence of one cell and span."""
 
     counts: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(ev.COUNTS, np.uint64))
     visits: int = 0
@@ -30,14 +30,14 @@ class CellEvidence:
     newest_ns: int = 0
 
     def add(self, other: CellEvidence) -> None:
-        """Sum, saturated."""
+        """Saturated sum."""
         self.counts = np.minimum(self.counts + other.counts, np.uint64(ev.COUNT_MAX))
         self.visits |= other.visits
         self.machines |= other.machines
         self.newest_ns = max(self.newest_ns, other.newest_ns)
 
     def plain(self) -> tuple[bytes, int, int, int]:
-        """To compare."""
+        """For comparison."""
         return self.counts.tobytes(), self.visits, self.machines, self.newest_ns
 
 
@@ -67,12 +67,12 @@ def folded(batches: Iterable[tuple[str, Table]], cell_m: float, config: FoldConf
 
 
 def by_definition(batches: Iterable[tuple[str, Table]], cell_m: float, config: FoldConfig) -> Evidence:
-    """What a grid is to hold of samples."""
+    """Expected content of a grid."""
     return settled(folded(batches, cell_m, config), config)
 
 
 def settled(evidence: Evidence, config: FoldConfig) -> Evidence:
-    """Hand on what is older than the newest spans of each tier, cell by cell."""
+    """Merge spans older than each tier's newest."""
     tiers = Tiers.from_config(config)
     spans, keeps = tiers.spans_ns.tolist(), tiers.keeps.tolist()
     kept: Evidence = {}
@@ -89,7 +89,7 @@ def settled(evidence: Evidence, config: FoldConfig) -> Evidence:
 
 
 def of_grid(grid: Grid) -> Evidence:
-    """What a grid holds."""
+    """Content of a grid."""
     evidence: Evidence = defaultdict(dict)
     for at in grid.state().pages:
         plane, place = np.divmod(at.page.votes["place"].astype(np.int64), ev.CELLS)
@@ -104,12 +104,12 @@ def of_grid(grid: Grid) -> Evidence:
 
 
 def plain(evidence: Evidence) -> dict[Cell, dict[Span, tuple[bytes, int, int, int]]]:
-    """To compare."""
+    """For comparison."""
     return {cell: {span: one.plain() for span, one in spans.items()} for cell, spans in evidence.items()}
 
 
 def _planes(bins: NDArray[np.int64], shares: NDArray[np.int64], sector: int) -> list[tuple[int, int]]:
-    """Lower bin of each value that there is, and the share (of 256) of the bin above; the sector, which has none."""
+    """Lower bin of each known value, and the share (of 256) of the next; the sector without one."""
     parts = zip((ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH), bins.tolist(), shares.tolist(), strict=True)
     return [
         *((part.start + lower, share) for part, lower, share in parts if lower >= 0),
@@ -118,7 +118,7 @@ def _planes(bins: NDArray[np.int64], shares: NDArray[np.int64], sector: int) -> 
 
 
 def _shares(votes: object, k: int) -> dict[Cell, int]:
-    """Integer shares of one sample's weight, by cell; what rounding down leaves over goes to the middle."""
+    """Integer shares of a sample's weight by cell; the rounding remainder goes to the middle."""
     (px, py), (xx, xy, yy) = votes.place[k].tolist(), votes.inverse[k].tolist()  # type: ignore[attr-defined]
     reach, weight = int(votes.reach[k]), int(votes.weight[k])  # type: ignore[attr-defined]
     column, row = int(np.floor(px)), int(np.floor(py))

@@ -1,6 +1,6 @@
-"""The cheapest line in steps to 64 neighbours, all cells searched: by scipy, over costs that numpy makes.
+"""Cheapest line in steps to 64 neighbours over all cells, by scipy with numpy costs.
 
-It shares nothing with what it judges but the meaning of a cost: the length in each cell times the cost per metre there.
+Shares only the definition of cost with the tested code: length in each cell times its cost per metre.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from mapserver.routes.grid_search import LEAST_COST
 from mapserver.routes.least_cost import Cell, CostField
 from protocol.arrays import Floats, Ints
 
-POINTS = 480  # that the length of a step is divided into
+POINTS = 480  # subdivisions of a step
 
 
 def neighbours(order: int) -> Ints:
-    """Steps (k, 2) in rows and columns: to 8 of order 1, 16 of 2, 32 of 3, 64 of 4, all of another direction."""
+    """Steps (k, 2) in rows and columns: 8 for order 1, 16 for 2, 32 for 3, 64 for 4, in distinct directions."""
     near: set[tuple[int, int]] = set()
     quarter = [(0, 1), (1, 0)]
     for _ in range(order):
@@ -32,7 +32,7 @@ def neighbours(order: int) -> Ints:
 
 
 def graph(terrain: CostField, steps: Ints) -> csr_matrix:
-    """Costs of all steps (k, 2) from all cells; of open ground."""
+    """Costs of all steps (k, 2) from all cells of open ground."""
     rows, columns = terrain.resistance.shape
     index = np.arange(rows * columns).reshape(rows, columns)
     starts, ends, costs = [], [], []
@@ -53,14 +53,14 @@ def graph(terrain: CostField, steps: Ints) -> csr_matrix:
 
 
 def least_cost(terrain: CostField, start: Cell, end: Cell, order: int = 4) -> float:
-    """Cost of the cheapest line from cell to cell."""
+    """Cost of the cheapest line between cells."""
     columns = terrain.resistance.shape[1]
     distance: Floats = dijkstra(graph(terrain, neighbours(order)), indices=start[0] * columns + start[1])
     return float(distance[end[0] * columns + end[1]])
 
 
 def _crossed(down: int, right: int) -> dict[tuple[int, int], float]:
-    """Cells that a step crosses, and which share of its length each has."""
+    """Crossed cells of a step, with their shares of its length."""
     at = (np.arange(POINTS) + 0.5) / POINTS
     cells = np.floor(np.stack([down * at, right * at], axis=1) + 0.5).astype(int)
     unique, counts = np.unique(cells, axis=0, return_counts=True)

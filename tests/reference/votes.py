@@ -1,4 +1,4 @@
-"""Samples into votes, in numpy: it shares with the kernels of the map server only the tables of fold_config.py."""
+"""Samples to votes in numpy; shares only the tables of fold_config.py with the map server's kernels."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ from protocol.arrays import Bools, Floats, Ints, Table
 
 @dataclass(frozen=True)
 class Votes:
-    """Prepared samples, one entry each, positions in cells.
+    """Prepared samples, positions in cells.
 
-    place: (n, 2) position; inverse: (n, 3) inverse covariance xx, 2 xy, yy; reach: (n,) half the stencil's edge, in
-    cells around the one that the sample lies in; weight: (n,); bins, shares: (n, 3) for resistance, grade east, grade
-    north; doubt (n,) in 1/256 of DOUBT_MOST; aided (n,) in 1/256; sector, stamp_ns, bucket: (n,); bits: (n, 2) one bit
-    set in each.
+    place: (n, 2); inverse: (n, 3) inverse covariance xx, 2 xy, yy; reach: (n,) half the stencil's edge around the
+    sample's cell; weight: (n,); bins, shares: (n, 3) for resistance, grade east, grade north; doubt (n,) in 1/256 of
+    DOUBT_MOST; aided (n,) in 1/256; sector, stamp_ns, bucket: (n,); bits: (n, 2), one bit set each.
     """
 
     place: Floats
@@ -46,12 +45,12 @@ class Votes:
 
 
 def prepare(rows: Table, machine: str, cell_m: float, config: FoldConfig) -> Votes:
-    """Turn foldable samples of one machine into votes."""
+    """Votes of one machine's foldable samples."""
     place = np.stack([rows["x_m"], rows["y_m"]], axis=1) / cell_m
     floor, per_m2 = STD_FLOOR_M**2, 1 / (cell_m * cell_m)
     xx = (rows["cov_xx_m2"].astype(np.float64) + floor) * per_m2
     yy = (rows["cov_yy_m2"].astype(np.float64) + floor) * per_m2
-    # samples are checked in single precision: what rounding lets pass must not make the covariance indefinite
+    # samples are checked in single precision; rounding must not make the covariance indefinite
     most = np.sqrt(rows["cov_xx_m2"].astype(np.float64) * rows["cov_yy_m2"].astype(np.float64))
     xy = np.clip(rows["cov_xy_m2"].astype(np.float64), -most, most) * per_m2
     scale = 1 / (xx * yy - xy * xy)
@@ -75,30 +74,30 @@ def prepare(rows: Table, machine: str, cell_m: float, config: FoldConfig) -> Vot
 
 
 def _doubt(variance: Floats) -> Ints:
-    std = np.sqrt(np.fmin(variance, ev.DOUBT_MOST**2))  # fmin: what states none is at its most
+    std = np.sqrt(np.fmin(variance, ev.DOUBT_MOST**2))  # fmin: unstated doubt is the largest
     return np.ceil(std * (ev.SHARE_ONE / ev.DOUBT_MOST)).astype(np.int64)
 
 
 def split_resistance(c_rr: Floats) -> tuple[Ints, Ints]:
-    """Lower bin and share (of SHARE_ONE) of the bin above it, linear in log(c_rr); beyond the ends, the end bins."""
+    """Lower bin and share (of SHARE_ONE) of the next, linear in log(c_rr), clipped."""
     return _split(np.searchsorted(RESISTANCE_STEPS, c_rr, side="right"), np.isnan(c_rr), ev.RESISTANCE_BINS)
 
 
 def split_grade(grade: Floats) -> tuple[Ints, Ints]:
-    """Lower bin and share (of SHARE_ONE) of the bin above it; beyond the ends, the end bins."""
+    """Lower bin and share (of SHARE_ONE) of the next, clipped."""
     unknown = np.isnan(grade)
     place = np.rint((np.where(unknown, 0.0, grade) - GRADE_LOW) * GRADE_STEPS)
     return _split(np.clip(place, 0, (ev.GRADE_BINS - 1) * ev.SHARE_ONE).astype(np.int64), unknown, ev.GRADE_BINS)
 
 
 def _split(place: Ints, unknown: Bools, bins: int) -> tuple[Ints, Ints]:
-    """Split a place on the axis of bins; what is unknown gives bin -1, which means no vote."""
+    """Split a place on the bin axis; unknown: bin -1, no vote."""
     lower = np.minimum(place // ev.SHARE_ONE, bins - 2)
     return np.where(unknown, -1, lower), np.where(unknown, 0, place - lower * ev.SHARE_ONE)
 
 
 def _bits(stamp_ns: Ints, machine: str) -> NDArray[np.uint64]:
-    """Bitmaps with the bit of the visit and the bit of the machine (a multiplicative hash takes the top six bits)."""
+    """Bitmaps of visit and machine (multiplicative hash, top six bits)."""
     name = np.uint64(name_hash(machine))
     visit = (name + (stamp_ns // VISIT_NS).astype(np.uint64)) * np.uint64(HASH)
     one = np.uint64(1)

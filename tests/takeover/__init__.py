@@ -1,1 +1,1 @@
-"""Take-overs of a journal in PostgreSQL: real servers, a real database, and a fault in each round."""
+"""Take-overs of a PostgreSQL journal: real servers and database, a fault per round."""

@@ -1,4 +1,4 @@
-"""`python -m tests.takeover --count N`: N take-overs in turn; prints what was lost or double, how long each took."""
+"""`python -m tests.takeover --count N`: N take-overs; prints lost and double samples, and durations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.takeover.site import FAULTS, TakeOverSite, round_of
 
 
 def main() -> int:
-    """Run; 1 where anything is wrong."""
+    """Run; 1 if anything is wrong."""
     parser = argparse.ArgumentParser(prog="tests.takeover", description=__doc__)
     parser.add_argument("--count", type=int, default=len(FAULTS), help="how many take-overs")
     parser.add_argument("--samples", type=int, default=0, help="so many are in the journal before")

@@ -1,4 +1,4 @@
-"""Machines that send batches without a spool, and write down every acknowledgement."""
+"""Machines without spool that record every acknowledgement."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BEGIN_NS = 1_767_225_600_000_000_000
 
 @dataclass(frozen=True)
 class Acknowledged:
-    """One acknowledgement as a machine received it. at_s: by this host's clock."""
+    """An acknowledgement as received. at_s: this host's clock."""
 
     machine: str
     watermark: int
@@ -38,7 +38,7 @@ class Acknowledged:
 
 
 class Sender(threading.Thread):
-    """Sends samples 1, 2, 3... of one machine, each until it is acknowledged. audit: a line per acknowledgement."""
+    """Sends samples 1, 2, 3... of one machine, each until acknowledged. audit: a line per acknowledgement."""
 
     def __init__(self, session: zenoh.Session, site: SiteConfig, machine: str, audit: Path, pause_s: float) -> None:
         super().__init__(name=machine, daemon=True)
@@ -80,7 +80,7 @@ class Sender(threading.Thread):
 
 
 def rows_of(first_seq: int, count: int) -> Table:
-    """Samples of a drive, each by its number: twice the same where they are sent twice."""
+    """Samples by number, reproducible."""
     seqs = first_seq + np.arange(count)
     rows = empty(count)
     usual = {"distance_m": 1.0, "c_rr": 0.04, "grade_e": 0.1, "grade_n": -0.05, "cov_xx_m2": 0.01, "cov_yy_m2": 0.01}

@@ -1,4 +1,4 @@
-"""One site with a router, a PostgreSQL database, and two map servers that take turns."""
+"""A site with router, PostgreSQL database, and two alternating map servers."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from tests.takeover.senders import BEGIN_NS, Acknowledged, Sender, rows_of
 from tests.tcp_proxy import FAIR, Proxy, Weather
 
 FENCED = 3
-ROWS, FILL_BATCH = 100, 100  # of a commit, and samples of a row, of what was there before
+ROWS, FILL_BATCH = 100, 100  # per commit, and samples per row, of the initial content
 SITE = SiteConfig("pit", 48.0, 11.0)
-_HEAD = struct.Struct("<qqQqB")  # of a record (docs/operation.md); nothing of the product is used to look at rows
+_HEAD = struct.Struct("<qqQqB")  # of a record (docs/operation.md), read without the product
 
 
 @dataclass
 class Server:
-    """A map server of the site. proxy: between it and the database."""
+    """A map server of the site. proxy: to the database."""
 
     name: str
     proxy: Proxy
@@ -44,14 +44,13 @@ class Server:
     serves: bool = False
 
     def is_serving(self) -> bool:
-        """Whether it has begun to."""
         self.serves |= any("ready" in line for line in self.child.lines())
         return self.serves
 
 
 @dataclass
 class Verdict:
-    """What acknowledgements and the database say together."""
+    """Verdict from acknowledgements and database."""
 
     acknowledged: int
     rows: int
@@ -68,12 +67,12 @@ class Verdict:
 
 
 class TakeOverSite:
-    """Started by `start`; every process is one of `children`."""
+    """The site, after `start`; every process is one of `children`."""
 
     def __init__(
         self, folder: Path, children: Children, database: Database, machines: int = 3, hosts: Sequence[Cluster] = ()
     ) -> None:
-        """hosts: where the database is or may be later, without a proxy; none for where it is, behind proxies."""
+        """hosts: of the database now or later, without proxy; none: proxied."""
         self._hosts = hosts
         self.folder, self.database, self._children = folder, database, children
         self.endpoint = free_endpoint()
@@ -85,7 +84,7 @@ class TakeOverSite:
         self.standby: Server | None = None
 
     def fill(self, samples: int) -> None:
-        """Have so many samples of an earlier machine in the journal, before any server starts."""
+        """Fill the journal with an earlier machine's samples before any server starts."""
         journal = JournalLocation(self.folder / "fill", self.database.url).open(SITE.name, SITE.frame)
         with closing(journal):
             for first in range(1, samples, ROWS * FILL_BATCH):
@@ -108,7 +107,6 @@ class TakeOverSite:
         self.add_standby()
 
     def add_standby(self) -> Server:
-        """Have another server wait."""
         self.standby = self._server()
         self.standby.child.expect("standby", PATIENCE_S)
         return self.standby
@@ -120,7 +118,7 @@ class TakeOverSite:
         return max((ack.epoch for ack in self.acknowledged()), default=0)
 
     def wait_for_acknowledgements(self, count: int = 1, beyond: int = 0) -> float:
-        """Wait for so many acknowledgements with an epoch beyond one; when the first of them came."""
+        """Wait for `count` acknowledgements with an epoch above `beyond`; returns the first one's time."""
 
         def seen() -> list[Acknowledged]:
             return [ack for ack in self.acknowledged() if ack.epoch > beyond]
@@ -130,10 +128,10 @@ class TakeOverSite:
         return seen()[0].at_s if beyond else time.time()
 
     def settle(self) -> None:
-        """After a fault: whoever ended is replaced, so that one serves and one waits."""
+        """Replace what ended after a fault, so that one server serves and one waits."""
         assert self.standby
         if not self.standby.is_serving() and self.active.child.code is None and self.standby.child.code is None:
-            return  # the active one went on
+            return  # the active one continued
         if self.standby.is_serving():
             self.active, self.standby = self.standby, self.active
         gone = self.standby
@@ -161,7 +159,7 @@ class TakeOverSite:
 
 
 def verdict(folder: Path, machines: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> Verdict:
-    """Compare audit files with the rows of the database: number and record, read by this module alone."""
+    """Compare audit files with database rows, by number and record, read independently."""
     there: Counter[tuple[str, int]] = Counter()
     for number, record in rows:
         assert zlib.crc32(record[:-4]) == int.from_bytes(record[-4:], "little")
@@ -192,17 +190,17 @@ def verdict(folder: Path, machines: Sequence[str], rows: Sequence[tuple[Any, ...
 
 
 def kill(site: TakeOverSite) -> None:
-    """The host of the active server loses its power, as far as others see."""
+    """The active server's host seems to lose power."""
     site.active.child.send(signal.SIGKILL)
 
 
 def stop(site: TakeOverSite) -> None:
-    """It hangs; the connection stands."""
+    """It hangs with its connection intact."""
     site.active.child.send(signal.SIGSTOP)
 
 
 def stop_in_commit(site: TakeOverSite) -> None:
-    """It hangs while a commit is in work, and its answer on the way."""
+    """It hangs during a commit, with the answer under way."""
     site.active.proxy.set(Weather(hold_back=True))
     time.sleep(0.05)
     site.active.child.send(signal.SIGSTOP)
@@ -215,7 +213,7 @@ def terminate(site: TakeOverSite) -> None:
 
 
 def cut_answer(site: TakeOverSite) -> None:
-    """The connection is cut between a COMMIT and its answer."""
+    """The connection breaks between COMMIT and its answer."""
     site.active.proxy.set(Weather(hold_back=True))
     time.sleep(0.1)
     site.active.proxy.set(Weather(cut=True))
@@ -223,12 +221,12 @@ def cut_answer(site: TakeOverSite) -> None:
 
 
 def cut_network(site: TakeOverSite) -> None:
-    """Nothing passes any more in either direction, and nobody says so."""
+    """Both directions silently drop everything."""
     site.active.proxy.set(Weather(hold_there=True, hold_back=True))
 
 
 def slow_commit(site: TakeOverSite) -> None:
-    """A commit takes longer than an idle session may, and the server is killed in it."""
+    """A commit outlasts the idle session limit, and the server is killed in it."""
     blocked = "SELECT pid FROM pg_stat_activity WHERE wait_event_type = 'Lock' AND application_name = 'sitegrid writer'"
     with psycopg.connect(site.database.url) as db:
         db.execute("SELECT * FROM sitegrid.head FOR UPDATE")
@@ -250,7 +248,7 @@ FAULTS: Sequence[Callable[[TakeOverSite], None]] = (
 
 
 def round_of(site: TakeOverSite, fault: Callable[[TakeOverSite], None]) -> dict[str, Any]:
-    """One fault, until batches are acknowledged under a new epoch and two servers stand again."""
+    """One fault, until a new epoch acknowledges batches and two servers stand again."""
     site.wait_for_acknowledgements(3)
     epoch, began_s = site.epoch(), time.time()
     fault(site)

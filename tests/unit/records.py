@@ -1,4 +1,4 @@
-"""Answers of a map server as records, with plain values for all that a test does not care about."""
+"""Map server answers as records, with defaults for what tests ignore."""
 
 from __future__ import annotations
 

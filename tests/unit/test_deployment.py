@@ -1,4 +1,4 @@
-"""compose.yaml and Dockerfile, checked without Docker: schema, lint, and every command by the real parser."""
+"""compose.yaml and Dockerfile without Docker: schema, lint, commands parsed."""
 
 import re
 import shutil
@@ -36,7 +36,7 @@ def is_database(service: dict) -> bool:
 
 
 def commands() -> list[list[str]]:
-    """The words after `sitegrid` of every command and health check."""
+    """Words after `sitegrid` of all commands and health checks."""
     commands = [list(service["command"]) for service in services().values() if not is_database(service)]
     checks = [service["healthcheck"]["test"] for service in services().values() if "healthcheck" in service]
     return commands + [list(test[2:]) for test in checks if test[1] == "sitegrid"]
@@ -60,7 +60,7 @@ def test_every_command_is_one_that_the_parser_takes():
     words = commands()
     assert len(words) == len(services()) - 2 + 3, "less the databases, and with three health checks"
     for line in words:
-        parser.parse_args(line)  # a usage error exits, and fails the test
+        parser.parse_args(line)  # a usage error exits and fails the test
 
 
 def test_everybody_meets_at_the_router():
@@ -102,7 +102,7 @@ def test_services_restart_and_need_no_privileges():
 
 
 def test_a_primary_that_died_never_comes_back_by_itself():
-    """Its replica may have been promoted meanwhile."""
+    """Its replica may have been promoted."""
     assert {name for name, service in services().items() if service["restart"] == "no"} == {"db-a", "db-b"}
 
 

@@ -1,4 +1,4 @@
-"""The command of the night: parts that fail stop no other, what has passed is not run again, hangs are ended."""
+"""The nightly command: failing parts stop no others, passed ones are not repeated, hangs end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.paths import ROOT
 
 
 def part(name: str, module: str, folder: Path, budget_s: float = 60.0) -> Part:
-    """A part that runs one line of Python as a module."""
+    """A part that runs a line of Python."""
     (folder / f"{name}.py").write_text(module)
     return Part(name, budget_s, ((name,),))
 

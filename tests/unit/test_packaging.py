@@ -1,4 +1,4 @@
-"""The generic names of the packages resolve to this project, and the project says what it is."""
+"""Generic package names resolve to this project, which describes itself."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_make_refuses_another_python_in_one_sentence_and_installs_nothing(root: 
     command = ["make", "--silent", "demo", f"PYTHON={python}", f"VENV={venv}"]
     made = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     assert made.returncode == 2
-    sentence, _ = made.stderr.splitlines()  # and what make says of its own
+    sentence, _ = made.stderr.splitlines()  # and make's own line
     assert sentence.startswith(f"Python 3.11, 3.12 or 3.13 is needed, and '{python}' is Python 3.14.0")
     assert (made.stdout, venv.exists()) == ("", False)
 
@@ -49,7 +49,7 @@ def test_make_refuses_another_python_in_one_sentence_and_installs_nothing(root: 
 def test_beside_the_clone_the_package_is_imported_and_not_the_folder(root: Path, tmp_path: Path):
     if not any((Path(sys.prefix) / stamp).exists() for stamp in (".dev", ".demo")):
         pytest.skip("this Python's environment was not made by `make`")
-    (tmp_path / "sitegrid").mkdir()  # as a clone's folder
+    (tmp_path / "sitegrid").mkdir()  # like a clone's folder
     code = "import sitegrid; print(sitegrid.__file__)"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env={}, capture_output=True, text=True, check=True

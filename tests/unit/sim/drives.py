@@ -1,4 +1,4 @@
-"""Drives of whole scenarios, for tests of the drivers: what happened, every tenth of a second."""
+"""Drives of whole scenarios for driver tests, sampled at 10 Hz."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from sim.scenario.tables import Scenario
 from sim.simulator import Simulator
 from sim.state import FleetState, stack
 
-EVERY = 10  # steps between two states that are kept
+EVERY = 10  # steps between kept states
 
 
 @dataclass(frozen=True)
 class Driven:
-    """States, payloads and distances (k, n), joints (k, n, 2); how far each joint was from its route (k / 5, n) [m].
+    """States, payloads and distances (k, n), joints (k, n, 2); distance of joints from their routes (k / 5, n) [m].
 
-    left_m, aim_m: how far it was left of its line, and was meant to be.
+    left_m, aim_m: actual and intended lateral offset, positive left.
     """
 
     scenario: Scenario
@@ -35,7 +35,7 @@ class Driven:
 
     @property
     def nearest_m(self) -> float:
-        """The least distance between the joints of two machines."""
+        """Least distance between two machines' joints."""
         pairs = itertools.combinations(np.moveaxis(self.joint_m, 1, 0), 2)
         return min(float(np.hypot(*(one - other).T).min()) for one, other in pairs)
 

@@ -1,4 +1,4 @@
-"""Worlds for tests of the physics, fast and in PyBullet: machines on an even plane."""
+"""Both worlds for physics tests: machines on an even plane."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -21,7 +21,7 @@ from sim.worlds.world import World
 LOADER, TRUCK = load_model("wheel_loader"), load_model("dump_truck")
 GRADE_15 = math.tan(math.radians(15))
 BOTH = pytest.mark.parametrize("model", [LOADER, TRUCK], ids=lambda m: m.name)
-# Laws that hold in both worlds. PyBullet is slow: where few of them and its recorded bytes show a fault too, by night.
+# Laws of both worlds. Slow PyBullet cases that rarely fail alone run by night.
 EACH_ALWAYS = pytest.mark.parametrize("kind", [FastWorld, BulletWorld], ids=["fast", "pybullet"])
 EACH = pytest.mark.parametrize(
     "kind", [FastWorld, pytest.param(BulletWorld, marks=pytest.mark.nightly)], ids=["fast", "pybullet"]
@@ -48,7 +48,7 @@ def placed(kind: type, terrain: Terrain, *models: MachineModel, starts: object =
 
 
 class Lane(NamedTuple):
-    """A machine on a soil of its own, and its heading."""
+    """A machine's soil and heading."""
 
     model: MachineModel = LOADER
     zone: int = CONCRETE
@@ -57,7 +57,7 @@ class Lane(NamedTuple):
 
 @contextmanager
 def lanes(kind: type, lanes: Sequence[Lane], grade_east: float = 0.0) -> Iterator[World]:
-    """Machines side by side, 100 m apart, on a plane: one world costs less than one for each."""
+    """Machines side by side, 100 m apart: one world is cheaper than one each."""
     zones = np.array([[lane.zone] for lane in lanes])
     terrain = replace(plane(0, grade_east), zones=zones, zone_cell_m=100.0)
     starts = [(500.0, 100.0 * i + 50.0, lane.yaw) for i, lane in enumerate(lanes)]
@@ -66,12 +66,12 @@ def lanes(kind: type, lanes: Sequence[Lane], grade_east: float = 0.0) -> Iterato
 
 
 def of_each(lanes: Sequence[Lane], name: str) -> np.ndarray:
-    """A value of the models, (n,)."""
+    """A model value, (n,)."""
     return np.array([getattr(lane.model, name) for lane in lanes])
 
 
 def cruise(world: World, speed: ArrayLike, seconds: float, steer: ArrayLike = 0.0) -> list[FleetState]:
-    """Drive the machines of a world at a speed each."""
+    """Drive a world's machines at given speeds."""
     states, integral, zero = [world.state], 0.0, np.zeros(len(world.state.x_m))
     for i in range(round(seconds / STEP_S)):
         aim = np.clip(speed, -i * STEP_S, i * STEP_S)
@@ -82,7 +82,7 @@ def cruise(world: World, speed: ArrayLike, seconds: float, steer: ArrayLike = 0.
 
 
 def idle(world: World, seconds: float, brake_n: ArrayLike = 0.0) -> FleetState:
-    """Let the machines of a world roll or stand."""
+    """Let a world's machines roll or stand."""
     zero = np.zeros(len(world.state.x_m))
     for _ in range(round(seconds / STEP_S)):
         world.advance(zero, zero, zero + brake_n)

@@ -1,4 +1,4 @@
-"""Rigs and made-up states for tests of the sensors: many machines at once are many draws of every error."""
+"""Rigs and synthetic states for sensor tests; many machines give many draws."""
 
 import math
 from collections.abc import Sequence
@@ -21,11 +21,11 @@ LOADER = load_model("wheel_loader")
 DGPS = load_preset("dgps")
 PROJECTION = Projection(SiteConfig("pit", 49.0, 8.4, 110.0))
 WIDTHS = {"rates_radps": 3, "rates_dot_radps2": 3, "force_mps2": 3, "wheel_radps": 2, "wheel_rad": 2}
-KEPT = ("_time_s", "_period_s", "_speed_mps", "correlation_s")  # no errors, and not to be 0
+KEPT = ("_time_s", "_period_s", "_speed_mps", "correlation_s")  # no errors, and nonzero
 
 
 def perfect() -> Preset:
-    """A preset without any errors; tests switch on the one that they look at."""
+    """A preset without errors; tests switch single ones on."""
     return Preset("perfect", *(_quiet(getattr(DGPS, f.name)) for f in fields(Preset) if f.name != "name"))
 
 
@@ -37,7 +37,7 @@ def _quiet(noise: object) -> object:
 
 
 def noisy(kind: str, **values: float) -> Preset:
-    """The perfect preset with these errors of one kind of sensor."""
+    """The perfect preset with these errors of one kind."""
     preset = perfect()
     return replace(preset, **{kind: replace(getattr(preset, kind), **values)})
 
@@ -53,7 +53,7 @@ def rig(
     doppler: bool = False,
     faults: Faults = Faults(),  # noqa: B008 - frozen
 ) -> Rig:
-    """A loader with these sensors. only: leave all other kinds out."""
+    """A loader with these sensors. only: this kind alone."""
     numbers = tuple(gps), tuple(imu), tuple(attitude)
     machine = machine_config("loader", LOADER, preset, *numbers, payload=payload, doppler=doppler)
     kept = tuple(s for s in machine.sensors if only in (None, s.kind))
@@ -61,25 +61,25 @@ def rig(
 
 
 def still(k: int, n: int = 1, **values: object) -> FleetState:
-    """States (k, n, ...) of machines at rest at the origin, but for these values."""
+    """States (k, n, ...) at rest at the origin, except these values."""
     arrays = {f.name: (k, n, WIDTHS[f.name]) if f.name in WIDTHS else (k, n) for f in fields(FleetState)}
     given = {"force_mps2": (0.0, 0.0, GRAVITY_MPS2), **values}
     return FleetState(**{name: np.broadcast_to(given.get(name, 0.0), shape) for name, shape in arrays.items()})
 
 
 def sampled(rigs: Sequence[Rig], states: FleetState, seed: int = SEED) -> FleetReadings:
-    """What sensors say of states at 100 Hz."""
+    """Readings of states at 100 Hz."""
     steps = np.arange(1, len(states.x_m) + 1)
     return Sensors(rigs, seed, PROJECTION).sample(steps, steps * 10_000_000, states)
 
 
 def groups(rigs: Sequence[Rig], states: FleetState, seed: int = SEED) -> dict[str, GroupReadings]:
-    """The same, by kind."""
+    """The same by kind."""
     return {group.kind: group for group in sampled(rigs, states, seed).groups}
 
 
 def values(one: Rig, kind: str, seconds: float, n: int = 1, **states: object) -> np.ndarray:
-    """Readings (r, n, columns) of n machines with one and the same rig."""
+    """Readings (r, n, columns) of n machines with the same rig."""
     return groups([one] * n, still(round(100 * seconds), n, **states))[kind].values
 
 
@@ -91,7 +91,7 @@ def to_map(fixes: np.ndarray) -> np.ndarray:
 
 
 def errors(preset: Preset, kind: str, seconds: float, n: int, **states: object) -> np.ndarray:
-    """Errors (r, n, columns) of level machines; of fixes [m], of attitudes as roll, pitch and heading [rad]."""
+    """Errors (r, n, columns) of level machines; fixes [m], attitudes as roll, pitch, heading [rad]."""
     truth = {"payload_kg": 4000.0, "torque_nm": 1e4, "yaw_rad": 0.0, **states}
     one = rig(preset, attitude=(3,), payload=True, only=kind)
     seen = values(one, kind, seconds, n, **truth)
@@ -106,11 +106,11 @@ def errors(preset: Preset, kind: str, seconds: float, n: int, **states: object) 
 
 
 def check_deviation(errors: np.ndarray, std: float, draws: int) -> None:
-    """Errors have this standard deviation about 0. draws: how many are independent; five standard errors may be."""
+    """Check a standard deviation about 0. draws: independent ones; tolerance five standard errors."""
     assert math.sqrt((errors**2).mean()) == pytest.approx(std, rel=5 / math.sqrt(2 * draws)), f"seed {SEED}"
 
 
 def check_correlation(errors: np.ndarray, lag: int, expected: float, draws: int) -> None:
-    """Errors (r, ...) that many rows apart correlate like this. draws: as in check_deviation."""
+    """Check the correlation of errors (r, ...) at a lag in rows. draws: as above."""
     correlation = (errors[lag:] * errors[:-lag]).mean() / (errors**2).mean()
     assert correlation == pytest.approx(expected, abs=5 / math.sqrt(draws)), f"seed {SEED}"

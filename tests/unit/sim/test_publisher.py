@@ -21,7 +21,7 @@ CONFIG = SimConfig(site="pit", world="fast", machines=2, seed=3, seconds=0.5, sp
 
 
 class Listener:
-    """Stands in for the agents: keeps the bundles of some machines, and tells when each stream has ended."""
+    """Stands in for agents: keeps bundles, and notes ends of streams."""
 
     def __init__(self, machines: tuple[str, ...]) -> None:
         self.bundles: dict[str, list[SensorBundle]] = {m: [] for m in machines}
@@ -58,7 +58,7 @@ def published(
     stop: threading.Event | None = None,
     **options,
 ):
-    """Run the publisher as the router itself, agents connect to it."""
+    """Run the publisher as the router."""
     endpoint, stop = free_endpoint(), stop or threading.Event()
     with ThreadPoolExecutor(1) as pool:
         result = pool.submit(run, config, SessionConfig(endpoint, mode="router"), stop, **options)
@@ -108,7 +108,7 @@ def test_machine_without_an_agent_is_named() -> None:
 
 
 class FakeStop(threading.Event):
-    """Waiting moves the clock on instead."""
+    """Waiting advances the clock."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The bytes of recordings in PyBullet: figures, presets and goals were found on these drives, so they must repeat."""
+"""Recordings in PyBullet repeat byte for byte: figures, presets and goals come from these drives."""
 
 import hashlib
 from contextlib import closing
@@ -17,7 +17,7 @@ TRACK = ("stamp_ns", "x", "y", "z", "yaw", "pitch", "roll", "speed", "mass", "c_
 
 
 class Recorded(NamedTuple):
-    """What a scenario gave when its hashes were taken. last_m: where its first and its last machine were in the end."""
+    """Hashes of a scenario. last_m: final places of the first and last machine."""
 
     seconds: float
     readings: str
@@ -25,7 +25,7 @@ class Recorded(NamedTuple):
     last_m: tuple[tuple[float, float], tuple[float, float]]
 
 
-# Taken when drivers kept to their lines, and stood at the ends of legs alone. Libraries are those of constraints.txt.
+# From drivers without wander and own stops, libraries as in constraints.txt.
 SCENARIOS = {
     "paper_site": Recorded(
         20.0,
@@ -60,5 +60,5 @@ def test_recordings_in_pybullet_keep_their_bytes(name: str) -> None:
             truth.update(np.ascontiguousarray(track[column]).tobytes())
     last_m = [(track["x"][-1], track["y"][-1]) for track in (tracks[0], tracks[-1])]
     np.testing.assert_allclose(last_m, known.last_m, rtol=0, atol=1e-6)  # on every processor
-    if arithmetic() == ARITHMETIC:  # where that of the hashes rounds otherwise, only the places can be compared
+    if arithmetic() == ARITHMETIC:  # other processors can only compare places
         assert (readings.hexdigest(), truth.hexdigest()) == (known.readings, known.truth)

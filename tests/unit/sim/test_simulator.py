@@ -102,7 +102,7 @@ def test_tracks_are_the_true_ways_at_10_hz() -> None:
         assert track["mass"][-1] == simulator.state.mass_kg[i]
         moved = np.hypot(np.diff(track["x"]), np.diff(track["y"]))
         np.testing.assert_allclose(moved, 0.1 * track["speed"][1:], atol=0.02)
-        assert (np.diff(track["work"], prepend=0.0) >= 0).all()  # brakes give nothing back
+        assert (np.diff(track["work"], prepend=0.0) >= 0).all()  # brakes return nothing
         kinetic_j = track["mass"][-1] * track["speed"][-1] ** 2 / 2
         assert track["work"][-1] > kinetic_j > 0
 
@@ -115,7 +115,7 @@ def test_recording_holds_the_same_readings_and_the_truth(tmp_path: Path) -> None
         log = open_log(tmp_path / "logs" / machine.name)
         assert log.machine == machine
         assert log.site == simulator.site
-        assert list(log.readings()) == BASE[machine.name]  # in the same order, too
+        assert list(log.readings()) == BASE[machine.name]  # in order, too
     truth = TruthMap.load(tmp_path / "truth" / "truth_map.npz")
     for f in fields(TruthMap):
         assert np.array_equal(getattr(truth, f.name), getattr(simulator.truth_map, f.name))

@@ -1,4 +1,4 @@
-"""Copies of stores: whole, consistent, read back; damage and what is missing are named."""
+"""Copies of stores: complete, consistent, verified; damage and gaps are named."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def send(store: Store, number: int, site: SiteConfig = SITE) -> None:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
-    """Ten batches, an hour each; three are in the archive."""
+    """Ten hourly batches, three archived."""
     folder, clock = tmp_path / "store", [T0]
     with closing(Store(JournalLocation(folder), SITE, ServerConfig(), lambda: clock[0])) as opened:
         for number in range(10):
@@ -95,7 +95,7 @@ def test_a_backup_of_an_open_store_is_restored_with_all_that_it_had(store: Path,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["again", "copy", "store"]
     with closing(Store(JournalLocation(tmp_path / "again"), SITE, ServerConfig(), time.time_ns)) as restored:
         assert restored.identity == identity, "a copy is the same store"
-        send(restored, 10)  # the machine sends again what came after the backup
+        send(restored, 10)  # the machine resends what followed the backup
     assert run("verify", store) == 0
     assert "11 journal rows with 220 samples of 1 machines" in capsys.readouterr().out
 
@@ -123,14 +123,14 @@ def change(store: Path, statement: str) -> None:
 
 
 def decided(store: Path) -> None:
-    """Have an event, and no mark that knows of it, as in a backup."""
+    """Add an event without updating the mark, as in a backup."""
     with closing(Store(JournalLocation(store), SITE, ServerConfig(), time.time_ns)) as opened:
         opened.decide(TrustDecision("a", False, PERSON, "drifts", T0))
     (store / f"{JOURNAL_FILE}-mark").unlink()
 
 
 def flip(path: Path) -> None:
-    """Flip a bit in the middle of the file's last samples."""
+    """Flip a bit in the file's last samples."""
     data = bytearray(path.read_bytes())
     at = data.rfind(rows_of(9).tobytes()[:40])
     data[at + 20 if at >= 0 else len(data) // 3] ^= 4
@@ -158,7 +158,7 @@ def test_a_store_that_lacks_what_was_acknowledged_is_not_copied_as_if_it_were_wh
         assert "lacks what was acknowledged: 40 acknowledged samples of a are gone" in error
         assert "start a map server on it once" in error
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
-    Store(JournalLocation(store), SITE, ServerConfig(), time.time_ns).close()  # it keeps a note of that
+    Store(JournalLocation(store), SITE, ServerConfig(), time.time_ns).close()  # records the shortfall
     assert run("backup", store, "--out", tmp_path / "copy") == 0
     assert "1 events" in capsys.readouterr().out
 
@@ -218,7 +218,7 @@ for number in range(10, 1_000_000):
 def test_backups_that_are_killed_leave_no_backup_and_the_one_that_ends_has_all_that_was_acknowledged_before(
     store: Path, tmp_path: Path
 ):
-    """A process commits batches all the time; backups are killed at random times."""
+    """A process commits constantly; backups are killed at random times."""
     draw = np.random.default_rng(1)
     noted = tmp_path / "acknowledged"
     with ExitStack() as ending:
@@ -235,7 +235,7 @@ def test_backups_that_are_killed_leave_no_backup_and_the_one_that_ends_has_all_t
                 except subprocess.TimeoutExpired:
                     os.kill(copier.pid, signal.SIGKILL)
                     killed += 1
-            if (tmp_path / "copy").exists():  # whole, though it may have been killed after that
+            if (tmp_path / "copy").exists():  # complete, even if killed afterwards
                 assert run("verify", tmp_path / "copy") == 0
                 (tmp_path / "copy").rename(tmp_path / f"copy-{copier.pid}")
         wait_until(lambda: noted.read_text() != "", PATIENCE_S, "a whole note")

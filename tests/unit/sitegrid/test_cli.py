@@ -1,4 +1,4 @@
-"""The command line: lazy, one-line errors, every sub-command described."""
+"""The command line: lazy, one-line errors, all sub-commands described."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_every_command_in_the_readme_is_one_that_the_parser_takes(root: Path, mo
         words[0] for words in commands
     }
     for words in commands:
-        command_line.build_parser().parse_args(words)  # a usage error exits, and fails the test
+        command_line.build_parser().parse_args(words)  # a usage error exits and fails the test
 
 
 BEYOND_BASE = {"cryptography", "cv2", "filterpy", "matplotlib", "numba", "pyarrow", "pybullet", "pyproj", "rich"}

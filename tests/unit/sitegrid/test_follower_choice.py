@@ -1,4 +1,4 @@
-"""Whom a client asks, and what it does with answers that are no simple ones: a session answers from a table."""
+"""Choice of processes, and unusual answers; the session answers from a table."""
 
 import time
 from collections import Counter
@@ -29,9 +29,9 @@ SILENT, HANGS, UNREADABLE = "nobody", "hangs", "unreadable"
 
 
 class Site:
-    """A session with a site: followers by name and the server, "", each with what it answers.
+    """A session with a site: followers by name, the server as "", with their answers.
 
-    server: answers of the server one after the other, the last one for ever.
+    server: its successive answers, the last one repeated.
     """
 
     def __init__(self, *server: bytes | QueryError, **answers: bytes | QueryError | str) -> None:
@@ -83,7 +83,7 @@ def test_a_map_is_asked_of_one_follower_and_of_nobody_else():
     site = Site(a=POINT, b=POINT)
     one = asker(site)
     origins = {one.ask(PointQuery(0, 0)).origin for _ in range(20)}
-    assert origins == {Origin(site.whom[0], 3, 0.25)}  # always the same: what it reads never goes back in time
+    assert origins == {Origin(site.whom[0], 3, 0.25)}  # one follower: reads never go back in time
     assert len(site.asked) == 20
 
 
@@ -112,7 +112,7 @@ def test_one_that_dies_or_hangs_is_replaced_and_not_asked_again_for_a_while(sile
     assert {first, other} == {"a", "b"}
     one.ask(PointQuery(0, 0))
     assert site.whom == [first, first, other, other]
-    assert max(site.timeouts) <= 5.0  # half of the time: then another one is asked
+    assert max(site.timeouts) <= 5.0  # half of the time, then another one
 
 
 def test_where_all_followers_are_silent_the_server_is_asked():
@@ -183,7 +183,7 @@ def test_pieces_of_a_region_are_asked_of_whoever_has_the_first(monkeypatch):
     def get(selector, timeout, asked=site.get):
         name = str(selector.key_expr).split("/")[3]
         query = str(selector.key_expr).rsplit("/", 1)[-1]
-        if query == "piece" and not gone:  # it dies between two pieces
+        if query == "piece" and not gone:  # dies between two pieces
             gone.append(name)
             site.answers.pop(name)
         if name in site.answers:

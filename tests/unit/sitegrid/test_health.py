@@ -1,4 +1,4 @@
-"""An agent's health in words: for its terminal, its end, and pages, whatever it holds."""
+"""Agent health in words for terminal, end and pages, whatever it holds."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Mishaps of all commands, in one process: each is one line on standard error, and the documented exit code.
+"""Mishaps of all commands in process: one line on standard error, and the documented exit code.
 
-Commands and their options come from the parser, so a new one is swept too. Signals and pipes of real processes:
+Commands and options come from the parser, so new ones are covered. Signals and pipes:
 `tests/integration/test_mishaps.py`.
 """
 
@@ -27,11 +27,11 @@ from sitegrid.process.lifetime import tell
 from tests.command_lines import COMMANDS, Command
 
 OUTPUTS = (OutputFile, OutputFolder)
-WAITS_S = 0.2  # here, for what is not there
+WAITS_S = 0.2  # for absent things
 
 
 def with_option(is_meant: Callable[[Action], bool]) -> list[Any]:
-    """Commands and one option of each that is meant, as parameters of a test."""
+    """Commands with each selected option, as test parameters."""
     return [
         pytest.param(command, option, id=f"{command.name} {option.dest}")
         for command in COMMANDS
@@ -41,7 +41,7 @@ def with_option(is_meant: Callable[[Action], bool]) -> list[Any]:
 
 
 def refused(words: Sequence[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line of a command that fails."""
+    """A failing command's only line."""
     capsys.readouterr()
     assert main(words) == 1, words
     errors = capsys.readouterr().err
@@ -53,7 +53,7 @@ def refused(words: Sequence[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a command writes where it stands is gone with the test; what is not there is not waited for."""
+    """Files go away with the test; absent things are not awaited."""
     monkeypatch.chdir(tmp_path)
     settings = session._settings
 
@@ -68,7 +68,7 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def endpoint() -> Iterator[str]:
-    """A router and nobody else."""
+    """A router alone."""
     endpoint = free_endpoint()
     router: Any = open_session(SessionConfig(endpoint, mode="router"))
     yield endpoint
@@ -83,7 +83,7 @@ def test_the_sweep_meets_commands_and_options():
 
 
 def with_all(*options: str) -> list[Any]:
-    """Commands that have all of these options, as parameters of a test."""
+    """Commands that have all of these options, as test parameters."""
     having = [c for c in COMMANDS if {*options} <= {option.dest for option in c.options()}]
     return [pytest.param(command, id=command.name) for command in having]
 
@@ -113,7 +113,7 @@ def test_what_cannot_be_written_is_refused_first(command: Command, option: Actio
     assert sorted(tmp_path.rglob("*")) == before, "trying leaves nothing"
 
 
-@pytest.mark.slow  # together; there are many
+@pytest.mark.slow  # many
 @pytest.mark.parametrize(("command", "option"), with_option(_is_input))
 def test_what_cannot_be_read_is_one_line(command: Command, option: Action, capsys, tmp_path):
     (tmp_path / "garbage").write_bytes(bytes(range(256)) * 9)
@@ -130,7 +130,7 @@ def test_what_cannot_be_read_is_one_line(command: Command, option: Action, capsy
 
 
 def _make_strange(folder: Path) -> None:
-    """A folder of a stranger: a manifest that names what nobody may read, and archives and stores that are none."""
+    """A stranger's folder: a manifest that names forbidden files, and invalid archives and stores."""
     folder.mkdir()
     manifest = (
         "[log]\nname = 'x'\n[site]\nname = 'lot'\norigin_lat_deg = 49\norigin_lon_deg = 8\n[machine]\nname = 'a'\n"
@@ -148,9 +148,9 @@ def _make_strange(folder: Path) -> None:
 def test_without_a_router_it_is_named(command: Command, capsys, tmp_path):
     nowhere = free_endpoint()
     given = {"endpoint": nowhere, "site_file": str(_site_file(tmp_path)), "store": "store"}
-    if command.words[0] == "export":  # which reads a store in place of a site
+    if command.words[0] == "export":  # reads a store instead of a site
         given = {"endpoint": nowhere}
-    if command.words[0] == "agent":  # which drives and records without one
+    if command.words[0] == "agent":  # drives and records without one
         assert "no [machine] is described" in refused(command.line(given | {"spool": "x.db"}), capsys)
     elif command.words[0] == "web":
         pytest.skip("waits for it: tests/integration/test_web.py")
@@ -173,7 +173,7 @@ def test_a_site_that_is_not_there_is_named(command: Command, capsys, endpoint: s
         assert main(command.line(given)) == 1
         assert "the router knows of no map server" in capsys.readouterr().out
     else:
-        named = "nothing-of-the-sort" if command.words[0] == "replay" else "elsewhere"  # the file is looked at first
+        named = "nothing-of-the-sort" if command.words[0] == "replay" else "elsewhere"  # the file is checked first
         assert named in refused(command.line(given), capsys)
     assert "elsewhere/*" in refused(command.line(given | {"site": "elsewhere/*"}), capsys)
 

@@ -1,4 +1,4 @@
-"""Answers in the forms of notebooks keep values, places, units and the frame."""
+"""Notebook answers keep values, places, units and frame."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -82,7 +82,7 @@ def test_roads_and_changes_are_tables_with_geometries_in_the_frame_of_the_site()
 
 
 class Info:
-    """Stands for a client that knows its site and its now."""
+    """A client that knows its site and now."""
 
     info, site_info = (lambda _: map_info(SITE, stamp_ns=10**18)), (lambda _: site_info(SITE))
     stamp, to_map, to_geodetic, _projection = Client.stamp, Client.to_map, Client.to_geodetic, Client._projection

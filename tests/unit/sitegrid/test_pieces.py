@@ -12,7 +12,7 @@ VERSION = MapVersion("0123456789abcdef", 7, 0)
 
 
 def piece(number: int, **changes) -> Region:
-    """One of two pieces of a region of 3 x 2 cells: two columns, then one."""
+    """One of two pieces of a 3 x 2 region: two columns, then one."""
     column, columns = (0, 2) if number == 0 else (2, 1)
     values = np.arange(6, dtype=np.float32).reshape(2, 3)[:, column : column + columns]
     place = replace(Piece(9, number, 2, column, 0, 3, 2), **changes)

@@ -1,4 +1,4 @@
-"""Answers about machines in words: each reason with its figures, calibrations with what shows them."""
+"""Machines in words: reasons with figures, calibrations with sources."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A watched map ends with the bits that a region has then, whatever came in between, and whoever was away."""
+"""A watched map ends with the region's bits, whatever arrived or failed in between."""
 
 from contextlib import closing, suppress
 from itertools import count
@@ -32,7 +32,7 @@ def until_enough(regions):
 
 
 class Site:
-    """A map that samples come into between two looks, late ones too; now and then nobody answers."""
+    """A map with samples between looks, late ones too, and occasional silence."""
 
     def __init__(self, writer: Writer, rounds: int) -> None:
         self.answers: AnswersOf = answers_of(writer)
@@ -46,7 +46,7 @@ class Site:
             raise EnoughError
         if self.draw.random() < 0.4:
             rows = self.draw.choice(BASE, 1) if look > self.rounds / 2 else random_samples(3, seed=look)
-            if look > self.rounds / 2:  # what no tile shows, as its values are of 8 bits: less than a step
+            if look > self.rounds / 2:  # below the tiles' 8-bit steps
                 rows["distance_m"] = 0.05
             send(self.writer, [incoming(rows, machine="loader", spool_id=look)])
             self.sent += 1

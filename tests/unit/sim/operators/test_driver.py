@@ -27,7 +27,7 @@ def quarry() -> Driven:
 @pytest.mark.parametrize("steer", [0.1, -0.4, 0.6])
 @pytest.mark.parametrize(("rear", "front"), [(1.65, 1.65), (3.0, 1.2)])
 def test_bend_is_the_articulation_of_the_joints_circle(steer: float, rear: float, front: float) -> None:
-    rear_radius = (front + rear * math.cos(steer)) / math.sin(steer)  # neither axle slides sideways
+    rear_radius = (front + rear * math.cos(steer)) / math.sin(steer)  # no axle slides sideways
     joint_radius = math.copysign(math.hypot(rear_radius, rear), rear_radius)
     assert bend(np.array(rear), np.array(front), np.array(1 / joint_radius)) == pytest.approx(steer, abs=1e-9)
 
@@ -71,7 +71,7 @@ def test_work_cycles_load_reverse_dump_and_wait_on_their_routes(quarry: Driven) 
         assert payload[:, machine].min() == pytest.approx(0.0)
         changing = np.abs(np.diff(payload[:, machine])) > 1e-6
         slowest = np.minimum(abs(speed[:-1, machine]), abs(speed[1:, machine]))
-        assert slowest[changing].max() < 0.05  # nobody is loaded while it moves
+        assert slowest[changing].max() < 0.05  # loaded at standstill only
         mass = quarry.states.mass_kg[:, machine] - payload[:, machine]
         assert np.ptp(mass) < 1.0
     still = (abs(speed[:, loader]) < 0.02).sum() * 0.1
@@ -84,7 +84,7 @@ def test_work_cycles_load_reverse_dump_and_wait_on_their_routes(quarry: Driven) 
 @pytest.mark.parametrize("machines", [5, pytest.param(9, marks=pytest.mark.nightly)])
 def test_machines_give_way(machines: int) -> None:
     driven = drive(SimConfig(world="fast", machines=machines, seed=2), 200.0)
-    assert driven.nearest_m > 5.0  # half as far, and frames would touch
+    assert driven.nearest_m > 5.0  # frames touch at half of it
     assert (abs(driven.states.speed_mps).sum(axis=0) * 0.1 > 550).all()
 
 
@@ -98,7 +98,7 @@ def test_without_give_way_machines_drive_on() -> None:
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_machines_do_not_touch_in_pybullet() -> None:
-    """Contact shows as a jolt: nothing else on the site shakes a frame so hard."""
+    """Contact shows as a jolt: nothing else shakes a frame so hard."""
     driven = drive(SimConfig(machines=6, seed=3), 80.0)
     level = driven.states.force_mps2[20:, :, :2]
     assert abs(level).max() < 6.0

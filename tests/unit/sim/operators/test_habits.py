@@ -22,7 +22,7 @@ def habits(config: DrivingConfig, machines: int = 1, seed: int = SEED) -> Habits
 
 
 def lateral_m(drawn: Habits, driven_m: Floats) -> Floats:
-    """Distances (k, n) from the lines after distances driven (k,)."""
+    """Lateral offsets (k, n) after distances driven (k,)."""
     n = len(drawn.left_m)
     return np.array([drawn.lateral_m(np.full(n, at)) for at in driven_m])
 
@@ -31,7 +31,7 @@ def lateral_m(drawn: Habits, driven_m: Floats) -> Floats:
 def test_wander_has_its_deviation_and_its_correlation_along_the_distance(wander_m: float, length_m: float) -> None:
     left_m = habits(DrivingConfig(wander_m, length_m), machines=200).left_m
     assert left_m.shape == (200, WANDER_STEPS)
-    assert left_m.std() == pytest.approx(wander_m, rel=0.03)  # the widest hundredth is cut off
+    assert left_m.std() == pytest.approx(wander_m, rel=0.03)  # clipped at the widest percent
     assert abs(left_m).max() <= DrivingConfig(wander_m, length_m).widest_m
     assert abs(left_m.mean()) < 0.02 * wander_m
     for lengths in (0.2, 0.5, 1.0, 2.0):
@@ -66,7 +66,7 @@ def test_habits_depend_on_the_seed_and_the_machine_alone() -> None:
     for name in ("left_m", "gap_m", "stop_s"):
         first = getattr(one, name)[0]
         np.testing.assert_array_equal(getattr(more, name)[0], first)
-        assert (getattr(more, name)[1] == first).mean() < 0.01  # the widest are all the same
+        assert (getattr(more, name)[1] == first).mean() < 0.01  # clipped values are equal
         assert (getattr(other, name)[0] == first).mean() < 0.01
 
 
@@ -103,7 +103,7 @@ def test_a_route_must_leave_room_for_drivers_who_wander(tmp_path: Path) -> None:
 
 
 def stops(driven: Driven, machine: int) -> list[tuple[float, float]]:
-    """Distance driven [m] and length [s] of each time that a machine stood for a second or more."""
+    """Distance driven [m] and duration [s] of each stop of at least a second."""
     still = abs(driven.states.speed_mps[:, machine]) < 0.02
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still, [0]]).astype(int)))
     spans = [(first, last) for first, last in edges.reshape(-1, 2).tolist() if first and last < len(still)]
@@ -127,7 +127,7 @@ def test_machines_stand_where_and_as_long_as_their_drivers_stop() -> None:
         at_m = np.cumsum(gaps_m)
         assert len(stood) >= 4
         planned = [(at, time) for at, time in zip(at_m, times_s, strict=True) if at < driven.driven_m[-1, machine] - 1]
-        for at, time in planned:  # others, where they wait for machines ahead, come on top
+        for at, time in planned:  # besides stops behind other machines
             assert any(abs(m - at) < 2.0 and time - 0.5 < s < time + 1.0 for m, s in stood), (at, time, stood)
     still = abs(driven.states.speed_mps) < 0.02
     assert 0.1 < still.mean() < 0.4

@@ -32,7 +32,7 @@ def test_course_follows_laps_and_goes_straight_on_beyond_open_ends() -> None:
     np.testing.assert_allclose(ahead[0], again[0], atol=1e-6)
     np.testing.assert_allclose(ahead[1], [50.0, 70.0], atol=0.01)
     assert course.limit(legs, np.full(2, 30.0)).max() == 4.0
-    far, _ = course.at(legs, course.length_m[legs] + 10 * BEYOND_M)  # nobody looks so far; nothing breaks
+    far, _ = course.at(legs, course.length_m[legs] + 10 * BEYOND_M)  # harmless, beyond any look-ahead
     assert np.isfinite(far).all()
 
 

@@ -13,7 +13,7 @@ from sim.simulator import Simulator
 
 
 def plan(monkeypatch: pytest.MonkeyPatch, scenario: str, **options: object) -> tuple[np.ndarray, list[str]]:
-    """The plan of a scenario, and the labels written on it."""
+    """A scenario's plan, and its labels."""
     written: list[str] = []
     label = Canvas.label
 
@@ -68,4 +68,4 @@ def test_one_picture_is_written(tmp_path, monkeypatch) -> None:
     height, width, _ = cv2.imread(str(path)).shape
     assert 1200 <= width <= 1850
     assert height <= 1850
-    assert len(cameras) == 3  # the site, a truck, a loader
+    assert len(cameras) == 3  # site, truck, loader

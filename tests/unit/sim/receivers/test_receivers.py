@@ -1,4 +1,4 @@
-"""What simulated receivers send, as libraries that others wrote read it, and as an agent does."""
+"""Simulated receivers' bytes, read by foreign libraries and by an agent."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from sim.receivers.receiver import SimulatedReceiver, Wiring, wire
 from sim.simulator import Simulator
 
 pytestmark = pytest.mark.slow
-SECONDS = 12.0  # an outage of 1 s within 10 s is in it
+SECONDS = 12.0  # contains an outage of 1 s within 10 s
 
 
 class Driven:
-    """A short drive: readings, wirings and bytes of one machine."""
+    """A short drive of one machine: readings, wirings, bytes."""
 
     def __init__(self, format_: str, preset: str, seed: int = 11) -> None:
         config = SimConfig("loading", world="fast", machines=1, seed=seed, seconds=SECONDS, receivers=format_)
@@ -98,7 +98,7 @@ def test_the_oracle_reads_imu_and_wheels_in_their_units(ubx: Driven) -> None:
 
 
 def test_two_antennas_fixed_by_carrier_phase_have_a_heading(ubx: Driven) -> None:
-    """Its variance is right: of 50 headings a few are off by more than twice as much."""
+    """Its variance is right: few of 50 headings err by more than two standard deviations."""
     base, rover = ubx.wirings
     read = by_pyubx2(ubx.sent[1], "NAV-RELPOSNED")
     assert by_pyubx2(ubx.sent[0], "NAV-RELPOSNED") == []

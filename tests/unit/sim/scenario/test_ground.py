@@ -17,7 +17,7 @@ SMOOTH = build_terrain(replace(PAPER, roughness_m=0.0), 0)
 def test_gradient_is_the_slope_of_the_height() -> None:
     rng = np.random.default_rng(1)
     terrain = Terrain(rng.standard_normal((20, 30)), 0.5, np.zeros((1, 1), np.int64), 1.0)
-    # stay clear of the cells' edges, where the bilinear surface has kinks
+    # avoids cell edges, where the bilinear surface has kinks
     x = (rng.integers(0, 28, 100) + rng.uniform(0.1, 0.9, 100)) * 0.5
     y = (rng.integers(0, 18, 100) + rng.uniform(0.1, 0.9, 100)) * 0.5
     east, north = terrain.gradient(x, y)

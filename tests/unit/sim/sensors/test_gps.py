@@ -21,7 +21,7 @@ from tests.unit.sim.sensor_rigs import (
     values,
 )
 
-N = 1000  # machines, hence independent draws
+N = 1000  # machines: independent draws
 
 
 def test_receivers_state_the_variance_of_their_errors() -> None:
@@ -37,7 +37,7 @@ def test_receivers_state_the_variance_of_their_errors() -> None:
 def test_drift_correlates_receivers_of_a_machine_and_of_the_site_by_their_shares(machine: float, site: float) -> None:
     preset = noisy("gps", drift_std_m=1.2, drift_time_s=0.2, machine_share=machine, site_share=site)
     two = [rig(preset, gps=(1, 2), only="gps")] * 2
-    seconds = 400  # of which readings 0.2 s apart correlate by 1/e: half of them count
+    seconds = 400  # readings 0.2 s apart correlate by 1/e: half of them count
     fixes = to_map(groups(two, still(100 * seconds, 2))["gps"].values)
     off = fixes - [[0.8, 0, 3.35], [0.3, 0.6, 3.35]] * 2
     for a, b, expected in ((0, 1, machine), (2, 3, machine), (0, 2, site), (1, 2, site), (0, 3, site)):
@@ -100,7 +100,7 @@ def test_antennas_sit_on_their_lever_arms() -> None:
 
 
 def test_velocities_are_those_of_antennas_also_on_a_turning_machine() -> None:
-    """Ahead at 2 m/s to the north, turning left by 0.5 rad/s: antennas ahead go west too, one at the left is slower."""
+    """2 m/s north, turning left by 0.5 rad/s: front antennas also go west, left ones are slower."""
     preset = noisy("gps", velocity_std_mps=0.05)
     turning = {"speed_mps": 2.0, "yaw_rad": math.pi / 2, "rates_radps": (0.0, 0.0, 0.5)}
     motion = groups([rig(preset, gps=(1, 2), only="gps_velocity", doppler=True)], still(40_000, **turning))[

@@ -47,7 +47,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
 
 
 def place(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of `base_link` on a made-up track."""
+    """Pose of `base_link` on a synthetic track."""
     at = np.array([3 * math.sin(0.5 * t), 2 * t - 0.3 * t**2, 0.2 * math.cos(2 * t)])
     return at, rotation(0.2 * math.sin(2 * t), -0.1 + 0.15 * math.cos(3 * t), 0.4 * t + 0.2 * math.sin(t))
 
@@ -65,7 +65,7 @@ def sensor_place(t: float, number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rate_and_force(pose: object, t: float, h: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
-    """Angular rate and specific force of a moving frame, by finite differences."""
+    """Angular rate and specific force by finite differences."""
     (before, r0), (now, r1), (after, r2) = (pose(t + d) for d in (-h, 0.0, h))  # type: ignore[operator]
     spin = r1.T @ (r2 - r0) / (2 * h)
     force = r1.T @ ((after - 2 * now + before) / h**2 + [0, 0, GRAVITY_MPS2])
@@ -93,7 +93,7 @@ def test_imus_on_both_frames_agree_with_finite_differences(number: int, t: float
 
 
 def turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The vector part of q v q*, written out."""
+    """Vector part of q v q*."""
     xyz, w = q[:3], q[3]
     return v + 2 * w * np.cross(xyz, v) + 2 * np.cross(xyz, np.cross(xyz, v))
 

@@ -33,7 +33,7 @@ FULL = rig(DGPS, gps=(1, 2), imu=(1, 3), attitude=(3,), payload=True)
 
 
 def moving(k: int, n: int) -> FleetState:
-    """Any states; those of a machine do not depend on how many there are."""
+    """Arbitrary states, independent of the number of machines."""
     rng = np.random.default_rng(SEED)
     whole = {f.name: rng.standard_normal((k, 10, WIDTHS.get(f.name, 1))) for f in fields(FleetState)}
     cut = {name: values[:, :n] if name in WIDTHS else values[:, :n, 0] for name, values in whole.items()}
@@ -45,7 +45,7 @@ def cut(states: FleetState, part: slice) -> FleetState:
 
 
 def run(rigs: Sequence[Rig], seed: int = SEED, span: int = 5) -> list[list[Reading]]:
-    """Readings of each machine, some steps at a time."""
+    """Each machine's readings, some steps at a time."""
     sensors, states = Sensors(rigs, seed, PROJECTION), moving(STEPS, len(rigs))
     readings: list[list[Reading]] = [[] for _ in rigs]
     for start in range(0, STEPS, span):
@@ -77,7 +77,7 @@ def test_readings_do_not_depend_on_other_machines(count: int) -> None:
 
 
 def test_readings_do_not_depend_on_other_sensors() -> None:
-    without = replace(DGPS, gps=replace(DGPS.gps, outage_s=0.0))  # receivers are lost in turn: their number matters
+    without = replace(DGPS, gps=replace(DGPS.gps, outage_s=0.0))  # outages are staggered by the number of receivers
     many = run([rig(without, gps=(1, 2, 3), imu=(1, 2, 3, 4), attitude=(1, 2, 3), payload=True)])[0]
     few = run([rig(without, gps=(2,), imu=(3,), attitude=(2,), payload=True)])[0]
     names = {reading.sensor for reading in few}
@@ -98,7 +98,7 @@ def test_readings_come_in_the_order_of_stamps_and_of_the_machines_sensors() -> N
 
 # --- errors ----------------------------------------------------------------------------------------------------------
 
-# Kind and rates of sensors, errors that they are given, and the deviation of each column.
+# Sensor kind, rates, errors, and each column's standard deviation.
 WHITE = [
     ("gps", (5, 10), {"white_std_m": 0.7}, (0.7, 0.7, 0.7 * 5 / 3)),
     ("imu", (100, 50), {"gyro_white_degps": 0.1, "force_white_mps2": 0.08}, (*np.radians([0.1] * 3), *[0.08] * 3)),

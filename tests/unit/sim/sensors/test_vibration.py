@@ -18,7 +18,7 @@ def test_presets_shake_by_what_their_names_say(name: str, mps2: float) -> None:
 
 
 def test_a_body_that_shakes_goes_nowhere() -> None:
-    """Means over ten readings are much smaller than those of white noise, whose are a third of one reading."""
+    """Means over ten readings are far below white noise's third of one reading."""
     seen = errors(
         noisy("imu", shake_mps2=2.0, degps_per_mps2=4.0, vibration_speed_mps=1.0), "imu", 5.0, N, speed_mps=4.0
     )
@@ -46,7 +46,7 @@ def test_a_machine_that_stands_shakes_with_its_engine_alone() -> None:
 def test_imus_of_one_machine_shake_alike_and_its_other_errors_stay_as_they_are() -> None:
     preset = noisy("imu", shake_mps2=1.0)
     both = values(rig(preset, imu=(3, 4), only="imu"), "imu", 0.5, speed_mps=4.0)
-    np.testing.assert_allclose(both[:, 0, 3], -both[:, 1, 4], atol=1e-9)  # IMU 4 is turned by a right angle
+    np.testing.assert_allclose(both[:, 0, 3], -both[:, 1, 4], atol=1e-9)  # IMU 4 is turned by 90 degrees
     quiet, shaking = (
         values(rig(replace(perfect(), imu=replace(load_preset("dgps").imu, shake_mps2=mps2)), only="imu"), "imu", 0.5)
         for mps2 in (0.0, 1.0)

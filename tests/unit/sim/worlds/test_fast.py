@@ -1,5 +1,3 @@
-"""The fast world's own physics."""
-
 import math
 from itertools import pairwise
 
@@ -16,7 +14,7 @@ from tests.unit.sim.planes import BOTH, GRADE_15, LOADER, TRUCK, cruise, idle, p
 
 
 def wheels(model: MachineModel, state: FleetState) -> np.ndarray:
-    """Places (4, 2) of the only machine's wheels: front left, front right, rear left, rear right."""
+    """Wheel places (4, 2) of the only machine: front left, front right, rear left, rear right."""
     yaw, front = state.yaw_rad[0], state.yaw_rad[0] + state.articulation_rad[0]
     rear_axle = np.array([state.x_m[0], state.y_m[0]])
     ahead, ahead_front = (np.array([math.cos(a), math.sin(a)]) for a in (yaw, front))
@@ -27,7 +25,7 @@ def wheels(model: MachineModel, state: FleetState) -> np.ndarray:
 
 
 def sunk_m(model: MachineModel, slope_rad: float) -> tuple[float, float]:
-    """How far the front and rear tyres of a parked empty machine give way on a slope, beyond those on the level."""
+    """Extra tyre deflection, front and rear, of a parked empty machine on a slope."""
     weight_n, level = model.mass_kg * GRAVITY_MPS2, model.front_share()
     uphill = model.centre_height_m() / model.wheelbase_m * math.sin(slope_rad)
     front_n, rear_n = (
@@ -59,7 +57,7 @@ def test_the_estimators_equation_holds_at_every_instant(model: MachineModel) -> 
         for state in cruise(world, 3.0, 6.0)[300:]:
             force = state.torque_nm[0] / model.wheel_radius_m - rolling * state.accel_mps2[0]
             squat = -state.pitch_rad[0] - slope
-            nodding = model.centre_height_m() * state.rates_dot_radps2[0, 1]  # of the centre, against `base_link`
+            nodding = model.centre_height_m() * state.rates_dot_radps2[0, 1]  # of the centre against `base_link`
             left = force / model.mass_kg - state.force_mps2[0, 0] - nodding + GRAVITY_MPS2 * squat
             assert left == pytest.approx(0.06 * state.load_n[0] / model.mass_kg, abs=1e-3)
 
@@ -81,7 +79,7 @@ def test_machines_rest_on_three_points_of_rough_ground(model: MachineModel, stee
     seen = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ up / np.linalg.norm(up)
     pitch, roll = state.pitch_rad[0], state.roll_rad[0]
     slope = -math.atan(seen[0] / seen[2])
-    sunk = sunk_m(model, slope)  # the tyres give way where the slope puts the weight
+    sunk = sunk_m(model, slope)  # tyres yield where the slope puts the weight
     squat = (sunk[1] - sunk[0]) / model.wheelbase_m
     np.testing.assert_allclose([pitch, math.sin(roll)], [-slope - squat, -seen[1]], atol=1e-6)
     assert state.z_m[0] == pytest.approx(rear[2] - sunk[1], abs=2e-5)
@@ -99,7 +97,7 @@ def test_brakes_hold_without_any_creep_and_slide_beyond_the_grip() -> None:
         start = world.state
         held = idle(world, 5.0, TRUCK.max_brake_n)
         assert (held.x_m, held.y_m, held.speed_mps) == (start.x_m, start.y_m, 0.0)
-        assert held.torque_nm[0] > 0  # it keeps from rolling back
+        assert held.torque_nm[0] > 0  # prevents rolling back
         assert idle(world, 1.0, 1e3).speed_mps[0] < -0.5
     with placed(FastWorld, plane(3, 0.6), TRUCK) as world:
         assert idle(world, 1.0, TRUCK.max_brake_n).speed_mps[0] < -0.5
@@ -118,7 +116,7 @@ def test_machines_do_not_feel_each_other() -> None:
 
 
 def test_rates_are_those_of_the_turning_frame() -> None:
-    """Angular rate in `base_link`, against what the rotation matrix does from step to step."""
+    """Angular rate in `base_link` against the change of the rotation matrix."""
     with placed(FastWorld, plane(0, 0.12, -0.07), LOADER) as world:
         states = cruise(world, 2.0, 6.0, 0.4)[-2:]
     matrices = []

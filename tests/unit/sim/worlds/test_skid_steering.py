@@ -1,4 +1,4 @@
-"""Machines that skid-steer, in the fast world."""
+"""Skid-steered machines in the fast world."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,7 @@ from sim.worlds.fast import FastWorld
 from tests.unit.sim.planes import LOADER, Lane, cruise, lanes
 
 SKID = load_model("skid_loader")
-TURN = 0.3  # of the joint that stands for the steering [rad]
+TURN = 0.3  # virtual joint angle [rad]
 
 
 def drive_over_weight(steer: float) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""What holds in both worlds, the fast one and PyBullet's."""
+"""Laws of both worlds."""
 
 import math
 from collections.abc import Sequence
@@ -65,7 +65,6 @@ def load_of(lanes: Sequence[Lane], slope_rad: float = 0.0) -> np.ndarray:
 
 
 def soil_of(lanes: Sequence[Lane]) -> np.ndarray:
-    """Rolling resistance under each machine."""
     return np.array([SOILS[lane.zone].c_rr for lane in lanes])
 
 
@@ -104,7 +103,7 @@ def test_steady_traction_on_15_degrees_adds_the_slope(kind: type) -> None:
         last = cruise(world, 2.0, 10.0)[-1]
     np.testing.assert_allclose(traction_of(cases, last), soil_of(cases) + uphill * GRADE_15, atol=0.002)
     np.testing.assert_allclose(last.load_n, load_of(cases, math.radians(15)), rtol=1e-3)
-    np.testing.assert_allclose(np.degrees(last.pitch_rad), -15 * uphill, atol=0.4)  # tyres give way by some mm
+    np.testing.assert_allclose(np.degrees(last.pitch_rad), -15 * uphill, atol=0.4)  # tyres yield by millimetres
 
 
 @EACH
@@ -167,7 +166,7 @@ def test_reversing_mirrors_driving(kind: type) -> None:
     wheel_mps = last.wheel_radps * of_each(cases, "wheel_radius_m")[:, None]
     np.testing.assert_allclose(wheel_mps, -2.0 / (1 - slip), rtol=0.005)
     assert (last.wheel_rad < -10).all()
-    assert turned.rates_radps[:, 2].max() < -0.05  # left articulation backwards turns it to the right
+    assert turned.rates_radps[:, 2].max() < -0.05  # left articulation in reverse turns right
 
 
 @EACH
@@ -255,7 +254,7 @@ def test_grade_and_attitude_are_those_of_the_plane(kind: type, model: MachineMod
     assert rest.grade_n[0] == pytest.approx(-0.07, abs=1e-6)
     up = np.array([-0.12, 0.07, 1.0]) / math.sqrt(1 + 0.12**2 + 0.07**2)
     c, s = np.cos(yaw), np.sin(yaw)
-    up_seen = rest.force_mps2[0] / GRAVITY_MPS2  # the vertical as the rear frame sees it
+    up_seen = rest.force_mps2[0] / GRAVITY_MPS2  # vertical in the rear frame
     np.testing.assert_allclose(up_seen[:2], [-up[0] * c - up[1] * s, up[0] * s - up[1] * c], atol=0.01)
 
 
@@ -287,7 +286,7 @@ def test_both_worlds_take_the_same_track_under_the_same_commands() -> None:
         with lanes(kind, cases, 0.02) as world:
             states = []
             for i in range(1500):
-                # off, straight, to the left, and a stop
+                # off, straight, left, stop
                 steer, drive, brake = 0.3 * (i > 600), 0.1 * (i < 1200), 0.2 * (i > 1200)
                 states.append(world.advance(np.full(2, steer), drive * weight_n, brake * weight_n))
             runs.append(stack(states))
@@ -297,7 +296,7 @@ def test_both_worlds_take_the_same_track_under_the_same_commands() -> None:
     assert driven[599].min() > 5
     assert driven[-1].min() > 30
     assert (apart[599] < 0.006 * driven[599]).all()
-    assert (apart.max(axis=0) < 0.03 * driven[-1]).all()  # steering pushes PyBullet's frames a little ahead
+    assert (apart.max(axis=0) < 0.03 * driven[-1]).all()  # steering pushes PyBullet's frames slightly ahead
     assert abs(fast.yaw_rad - bullet.yaw_rad).max() < 0.1
     np.testing.assert_allclose(fast.articulation_rad, bullet.articulation_rad, atol=0.01)
     np.testing.assert_allclose(fast.drive_n, bullet.drive_n, atol=1.0)
@@ -322,7 +321,7 @@ def test_squat_at_steady_speed_is_that_of_the_axles_loads(kind: type, slope_deg:
         machine = machine_config("a", case.model, load_preset("dgps"), (), (), ())
         assert nose_up == pytest.approx(squat_rad(machine, payload_kg[i], force_x), abs=0.0005)
         if payload_kg[i] or slope_deg:
-            assert abs(nose_up) > 0.002  # else there would be nothing to see
+            assert abs(nose_up) > 0.002  # else nothing to see
 
 
 def test_head_on_collision_stays_finite_and_nobody_passes_through() -> None:
@@ -335,6 +334,6 @@ def test_head_on_collision_stays_finite_and_nobody_passes_through() -> None:
     assert all(np.isfinite(getattr(run, f.name)).all() for f in fields(FleetState))
     gap = np.hypot(run.x_m[:, 1] - run.x_m[:, 0], run.y_m[:, 1] - run.y_m[:, 0])
     assert run.speed_mps[:, 0].max() > 2.5
-    assert gap.min() > 2 * 5.25 - 0.3  # from rear axle to bucket, twice
+    assert gap.min() > 2 * 5.25 - 0.3  # rear axle to bucket, twice
     assert abs(run.speed_mps[-1]).max() < 0.1
     assert abs(run.roll_rad).max() < 0.2

@@ -1,4 +1,4 @@
-"""Options of the commands reach what they are for."""
+"""Options of commands reach their targets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keys, the register, and the rules that the router makes from it."""
+"""Keys, register, and the router's rules."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ AGENT_FILES = ("--site-file", "config/site.toml", "--config", "config/agent.toml
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder of keys of a site."""
     made = tmp_path / "keys"
     assert main(["keys", "init", "--dir", str(made), "--site", SITE, "--host", "10.0.0.5", "router.site"]) == 0
     return made
@@ -49,7 +48,7 @@ def certificate(folder: Path, name: str) -> x509.Certificate:
 
 
 def refused(capsys, folder: Path, action: str, *words: str) -> str:
-    """The one line of an error."""
+    """The error's only line."""
     capsys.readouterr()
     assert act(folder, action, *words) == 1
     error = capsys.readouterr().err
@@ -191,14 +190,14 @@ def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys):
 
 
 def change(path: Path, old: str, new: str) -> None:
-    """Write another text behind a checksum that is right."""
+    """Change the text and reseal it."""
     _, _, text = path.read_text().partition("\n")
     path.write_text(sealed(text.replace(old, new)))
 
 
 @pytest.mark.parametrize("place", ["register.toml", "tokens.toml", "server/identity.toml"])
 def test_no_flipped_bit_lets_anybody_in(folder: Path, place: str):
-    """Bits all over what `sitegrid keys` writes as text: it is refused, with the file's name."""
+    """Bits all over the text files: refused by file name."""
     path = folder / place
     act(folder, "token", "anna")
     loads = {"register.toml": load_register, "tokens.toml": load_tokens, "identity.toml": load_credentials}
@@ -256,7 +255,7 @@ def test_a_machine_knows_the_keys_of_the_map_servers_which_outlast_a_new_certifi
     assert act(folder, "revoke", "server") == 0
     assert load_register(folder).server_keys() == []
     assert act(folder, "add", "server", "--role", "server") == 0
-    assert load_register(folder).server_keys() not in ([], known)  # after a theft it is another one
+    assert load_register(folder).server_keys() not in ([], known)  # differs after a theft
 
 
 # --- rules -----------------------------------------------------------------------------------------------------------
@@ -275,7 +274,7 @@ REGISTER = Register(
 
 
 def may(name: str, message: str, key: str, flow: str = "ingress", register: Register = REGISTER) -> bool:
-    """Whether the rules of a name let a message pass, by Zenoh's own comparison of keys."""
+    """Whether a name's rules pass a message, by Zenoh's own comparison."""
     control = access_control(register)
     assert (control["enabled"], control["default_permission"]) == (True, "deny")
     mine = {rule for policy in control["policies"] if name in policy["subjects"] for rule in policy["rules"]}

@@ -1,4 +1,4 @@
-"""`sitegrid log`, in process: tables, JSON, exit codes, and errors of one line."""
+"""`sitegrid log` in process: tables, JSON, exit codes, one-line errors."""
 
 import json
 from pathlib import Path
@@ -58,7 +58,7 @@ def test_run_prints_rows_and_what_it_cannot_compare_and_draws(circle: Path, caps
     assert list(report["missing"]) == ["ground"]
 
 
-REFUSED = {  # what is written to which file, words of the command, what is said
+REFUSED = {  # change of a file, command words, message
     "no manifest": ("log.toml", None, ["run"], "has no log.toml that describes its files; docs/log-folders.md"),
     "no TOML": ("log.toml", "[log", ["check"], "log.toml: not valid TOML"),
     "no file": ("gps.csv", None, ["run"], "gps.csv: is not there; `--data` names the folder of the files"),

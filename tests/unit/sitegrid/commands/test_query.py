@@ -1,4 +1,4 @@
-"""`sitegrid query`: options become queries, answers become lines or JSON."""
+"""`sitegrid query`: options to queries, answers to lines or JSON."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SITE = SiteConfig("pit", 48.0, 11.0)
 
 
 class Session:
-    """Stands for a Zenoh session: answers queries from a table, and notes them and their time-outs."""
+    """A Zenoh session that answers from a table, and records queries and timeouts."""
 
     def __init__(self, now_ns: int = T0) -> None:
         self.asked: list[MapQuery] = []
@@ -234,7 +234,7 @@ def test_a_history_is_asked_with_its_times(session: Session, capsys):
     assert session.asked[0] == HistoryQuery(1.0, -2.0, ("a", "b"))
     assert session.asked[2] == HistoryQuery(1.0, -2.0, query.HISTORY_LAYERS, T0 - 3600 * S, T0, 60.0)
     assert main(["query", "history", "1", "-2", "--json"]) == 0
-    assert session.asked[3] == HistoryQuery(1.0, -2.0)  # all layers, which no terminal is wide enough for
+    assert session.asked[3] == HistoryQuery(1.0, -2.0)  # all layers, too wide for any terminal
     assert main(["query", "history", "1", "2", "--span", "0"]) == 1
     assert "parameter `span`: 0 s is not between 1" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""Machines, trust and changes from Python and from the command line."""
+"""Machines, trust and changes from Python and the command line."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ CALIBRATION = CalibrationAnswer(
 
 
 class FakeServer:
-    """Answers machines, calibration, changes and trust on a router of its own, and notes what it was asked."""
+    """Answers machines, calibration, changes and trust on its own router, and records queries."""
 
     def __init__(self) -> None:
         self.endpoint = free_endpoint()
@@ -129,7 +129,7 @@ def sitegrid(server: FakeServer, *words: str) -> int:
 
 
 class Callback:
-    """A callback that keeps what it is called with; change 666 makes it fail."""
+    """A recording callback that fails on change 666."""
 
     def __init__(self) -> None:
         self.events: list[GroundChange] = []
@@ -152,7 +152,7 @@ def test_a_change_calls_back_until_it_is_closed(server: FakeServer, client: Clie
     first, other = Callback(), Callback()
     listener = client.on_change(first)
     client.on_change(other)
-    client.changes()  # the server knows of the subscription with this answer
+    client.changes()  # its answer proves the subscription is known
     failing = replace(CHANGE, id=666)
     for payload in (b"no message", encode_change({"id": 5}), encode_change(failing), encode_change(CHANGE)):
         server.publish(payload)
@@ -289,7 +289,7 @@ def test_changes_are_a_line_each(server: FakeServer, capsys):
 
 @pytest.mark.parametrize("as_json", [True, False])
 def test_changes_are_followed_until_stopped(server: FakeServer, monkeypatch, capsys, as_json: bool):
-    """The change that is known, then one that is found while following."""
+    """The known change, then one found while following."""
     stop = threading.Event()
     monkeypatch.setattr(query, "stop_flag", lambda: stop)
     shown: list[str] = []

@@ -1,4 +1,4 @@
-"""Bags of made-up drives, by rosbags' own writers."""
+"""Bags of synthetic drives, written by rosbags."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from rosbags.typesys import Stores, get_typestore
 
 T0 = 1_750_000_000_000_000_000
 STEP_NS = 100_000_001
-LATE_NS = 7_000_000  # from a message's stamp to the recorder
+LATE_NS = 7_000_000  # from stamp to recorder
 FORMS = ("bag", "sqlite3", "mcap")
-Said = tuple[int, dict[str, Any]]  # the recorder's time [ns], and fields of a message
+Said = tuple[int, dict[str, Any]]  # recorder's time [ns], message fields
 
 
 @cache
@@ -27,7 +27,7 @@ def types(form: str) -> Any:
 
 
 def write_bag(folder: Path, form: str, topics: dict[str, tuple[str, Sequence[Said]]]) -> Path:
-    """A bag of messages by topic; what to hand to the converter."""
+    """A bag of messages by topic; returns the converter's input."""
     store, path = types(form), folder / f"drive.{form}"
     plugin = StoragePlugin.MCAP if form == "mcap" else StoragePlugin.SQLITE3
     with Writer1(path) if form == "bag" else Writer2(path, version=9, storage_plugin=plugin) as writer:
@@ -41,7 +41,7 @@ def write_bag(folder: Path, form: str, topics: dict[str, tuple[str, Sequence[Sai
 
 
 def made(store: Any, name: str, given: dict[str, Any]) -> Any:
-    """A message with these fields, and zeros in the others."""
+    """A message with these fields, zeros elsewhere."""
     values = {}
     for field, (node, detail) in store.fielddefs[name][1]:
         if node == Nodetype.NAME:

@@ -1,4 +1,4 @@
-"""Recordings of others become log folders that hold what was recorded, or nothing; what is unclear is asked."""
+"""Foreign recordings become complete log folders, or none; ambiguities are asked."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STAMPS = [T0 + i * STEP_NS for i in range(N)]
 
 
 def said(fields: Any, stamps: list[int] = STAMPS, frame: str = "base_link") -> list[tuple[int, dict[str, Any]]]:
-    """Messages with what `fields` makes of their number."""
+    """Messages from `fields` of their number."""
     return [(T0 + i * STEP_NS + LATE_NS, {"header": header(ns, frame), **fields(i)}) for i, ns in enumerate(stamps)]
 
 
@@ -59,7 +59,7 @@ ODOM = ("/odom", ("odometry",))
 
 
 def rows(log: LogFolder, kind: str) -> list[tuple[float, ...]]:
-    """Stamps and values of the readings of a kind, which come out of the log's door."""
+    """Stamps and values of a kind, read through the log."""
     return [(r.stamp_ns, *(getattr(r, name) for name in columns(kind))) for r in log.readings() if r.kind == kind]
 
 
@@ -341,12 +341,12 @@ def test_real_recordings_are_read_whole(tmp_path: Path, name: str, takes: Any, c
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_a_raw_bag_is_the_held_log_of_its_drive_but_for_the_digits_that_the_log_was_cut_to(tmp_path: Path) -> None:
-    """The held log was written with 0.1 ms, nine decimals of degrees, and six digits of the rest."""
+    """The reference log has 0.1 ms, nine decimals of degrees, six digits elsewhere."""
     data = recording("ros1_husky.bag").parents[1] / "rl_test1_husky"
     convert(recording("ros1_husky.bag"), tmp_path / "log", [("/husky_velocity_controller/odom", ("odometry",))])
     raw, held = open_log(tmp_path / "log"), open_log(ROOT / "lab/logs/rl_test1_husky", data)
     for kind, digits in (("gps", "{:.9f}"), ("imu", "{:.6g}"), ("odometry", "{:.6g}")):
-        n_values = 2 if kind == "odometry" else None  # the held log leaves its turn out
+        n_values = 2 if kind == "odometry" else None  # the reference log lacks turn rates
         pairs = list(zip(rows(raw, kind), rows(held, kind), strict=True))
         assert max(abs(mine[0] - theirs[0]) for mine, theirs in pairs) < 51_000, kind
         for mine, theirs in pairs:
@@ -359,7 +359,7 @@ def test_two_talkers_are_one_receiver_or_two_and_somebody_says_so(tmp_path: Path
 
 
 def test_a_recording_of_a_bus_becomes_a_log_folder_and_an_engine_waits_for_its_powertrain(tmp_path: Path) -> None:
-    """The same values as an agent reads; of two speeds one is taken, and one offered."""
+    """The agent's values; of two speeds one is taken, one offered."""
     values = {"engine_torque": 0.4, "engine_speed": 150.0, "rear_left_speed": 2.0, "rear_right_speed": 2.0}
     values |= {"vehicle_speed": 2.0, "latitude": 49.01, "longitude": 8.4, "fuel_rate": 20.0}
     groups = {SIGNALS[name].group for name in values}

@@ -1,4 +1,4 @@
-"""The demo's plan: each option reaches what it should."""
+"""The demo's plan: options reach their targets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The doctor: each check by itself, and the whole on a router and a map server in this process."""
+"""The doctor: single checks, and the whole against a router and map server in process."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> Followe
         (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait, 2 of them for the smoother; "),
         (disk.check_health("loader-1", {"status": 7, "problems": "?"}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "dropped": 1}}), WARN, "1 were dropped"),
-        # what others say may be anything
+        # foreign values may be anything
         (disk.check_health("loader-1", {}), PASS, "? samples wait"),
         (positions(a="cannot_tell"), PASS, "a cannot tell; a slow GPS error that is larger than stated would not show"),
         (positions(a="consistent", b="inconsistent"), WARN, "b inconsistent; fixes are further off than"),
@@ -319,7 +319,7 @@ def test_a_store_whose_log_is_damaged_is_a_finding_before_the_server_starts(tmp_
         for first_seq in (1, 5, 9):
             payload = encode_batch(SampleBatch("loader-1", 5, first_seq, samples(4), SITE.frame))
             assert isinstance(store.commit([Incoming("loader-1", payload)])[0], Ack)
-        shutil.copytree(tmp_path / "store", left)  # as kill -9 leaves it
+        shutil.copytree(tmp_path / "store", left)  # as after kill -9
     assert disk.read_store(left, time.time()).shortfall == ""
     log = left / "journal.db-wal"
     log.write_bytes(log.read_bytes()[:-3000] + bytes(3000))
@@ -408,7 +408,7 @@ def test_a_router_without_a_server_is_found_out(site: Site, capsys):
 
 @contextlib.contextmanager
 def answering(site: Site, key: str, data: bytes) -> Iterator[None]:
-    """Somebody who answers on a key; with nothing where there are no data, as where a router denies."""
+    """A queryable on a key; without data it is silent, like a denying router."""
 
     def reply(query: Any) -> None:
         with query:

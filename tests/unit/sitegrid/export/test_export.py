@@ -1,4 +1,4 @@
-"""The map of a store as files, read back by programs of others: the same bits, at the right places, whole or absent."""
+"""A store's map as files, read back by foreign programs: same bits, right places, complete or missing."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ FILES = {suffix: f"map{suffix}" if form.usual else f"{form.holds[-2]}{suffix}" f
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive of haulers on three roads, one of which is repaired."""
+    """An archive of haulers on three roads, one repaired."""
     folder = tmp_path_factory.mktemp("archive")
     rows = [(one.name, table) for one in haulers() for table in one._days]
     write(folder, [JournalRow(i, name, 7, 1 + 10_000 * i, table, 1) for i, (name, table) in enumerate(rows, 1)])
@@ -61,7 +61,7 @@ def store(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def known(store: Path):
-    """The same store, asked in process."""
+    """The same store, queried in process."""
     with maps.opened(SimpleNamespace(store=store, site_file=None, config=None)) as opened:
         yield opened
 
@@ -144,7 +144,7 @@ def test_every_form_of_features_has_the_same_ones(what, store, tmp_path):
     parquet = geopandas.read_parquet(tmp_path / names[2])
     for name in names[:2]:
         other = geopandas.read_file(tmp_path / name).to_crs(parquet.crs)
-        if len(other) or name.endswith(".fgb"):  # GeoJSON says nothing of what it does not hold
+        if len(other) or name.endswith(".fgb"):  # empty GeoJSON has no columns
             assert [*other.columns] == [*parquet.columns]
         assert sorted(other.length) == pytest.approx(sorted(parquet.length), rel=1e-3)
         assert len(other) == len(parquet)

@@ -30,7 +30,7 @@ def answer(c_rr: np.ndarray, x: int = 0, y: int = 0) -> TilesAnswer:
 
 
 def features(collection: Collection) -> list[dict[str, Any]]:
-    """As the web server sends them."""
+    """As sent by the web server."""
     return json.loads(b"".join(pieces(geojson(collection, PROJECTION))))["features"]
 
 

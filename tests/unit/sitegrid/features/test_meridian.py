@@ -1,4 +1,4 @@
-"""What lies across the 180th meridian is cut there: no part crosses it, and together they are the whole."""
+"""Geometry across the 180th meridian is cut: no part crosses it, together they are the whole."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from sitegrid.features.meridian import geometry
 
 
 def placed(ring: list[tuple[float, float]]) -> list[list[float]]:
-    """Corners east of the meridian and north of the equator [deg], closed, as longitude and latitude."""
+    """Closed corners east of the meridian and north of the equator [deg], as longitude and latitude."""
     return [[180 + x if x < 0 else x - 180, y] for x, y in [*ring, ring[0]]]
 
 
@@ -19,7 +19,7 @@ def area(ring: np.ndarray) -> float:
 
 COMB = [(-3, 0), (2, 0), (2, 1), (-1, 1), (-1, 2), (2, 2), (2, 3), (-1, 3), (-1, 4), (2, 4), (2, 5), (-3, 5)]
 SQUARE = [(-3, 0), (3, 0), (3, 6), (-3, 6)]
-CASES = {  # rings, and how many parts and holes there are on either side
+CASES = {  # rings, and numbers of parts and holes on either side
     "a square": ([SQUARE], 2, 0),
     "the other way round": ([SQUARE[::-1]], 2, 0),
     "begun in the east": ([SQUARE[1:] + SQUARE[:1]], 2, 0),

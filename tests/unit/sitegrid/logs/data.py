@@ -1,4 +1,4 @@
-"""Made-up logs: a machine on a circle, with wheels, IMU, torque and fixes."""
+"""Synthetic logs: a machine on a circle with wheels, IMU, torque and fixes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SECONDS = 80
 
 
 def moves(t: float) -> bool:
-    """Whether the machine drives: it starts and stops, at no fixed intervals."""
+    """Whether the machine drives; irregular intervals."""
     return not (t < 4 or 17 <= t < 23 or 41 <= t < 44 or 60 <= t < 68)
 
 
@@ -36,14 +36,14 @@ DRIVEN_S = [0.0, *accumulate(0.1 * moves(i / 10) for i in range(10 * SECONDS))]
 
 
 def at(t: float) -> tuple[float, float]:
-    """A place on the circle; a fix is 5 cm off, another way each time, so that none repeats the one before."""
+    """A place on the circle; fixes are 5 cm off, differently each time, so that none repeats."""
     turned = RATE_RADPS * DRIVEN_S[round(t * 10)]
     off_m = 0.05 * math.sin(100 * t)
     return 100 + RADIUS_M * math.cos(turned) + off_m, 50 + RADIUS_M * math.sin(turned)
 
 
 def write_circle(folder: Path) -> Path:
-    """A log of 80 s: fixes at 2 Hz, wheels at 10 Hz; a machine that drives and stands."""
+    """A log of 80 s: fixes at 2 Hz, wheels at 10 Hz; driving and standing."""
     times = [i / 10 for i in range(10 * SECONDS)]
     fixes = [(t, *at(t)) for t in times[::5]]
     odometry = [(t, RADIUS_M * RATE_RADPS * moves(t), RATE_RADPS * moves(t)) for t in times]
@@ -58,6 +58,6 @@ def write(path: Path, names: str, rows: list[tuple[float, ...]]) -> None:
 
 
 def edit(path: Path, change) -> None:
-    """Change the rows of a CSV file below its first line."""
+    """Change a CSV file's rows below the header."""
     head, *rows = path.read_text().splitlines()
     path.write_text("\n".join([head, *change([row.split(",") for row in rows])]) + "\n")

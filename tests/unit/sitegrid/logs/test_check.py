@@ -1,4 +1,4 @@
-"""What `sitegrid log check` says of recordings as engineers bring them."""
+"""`sitegrid log check` on realistic recordings."""
 
 import gzip
 import math
@@ -25,7 +25,7 @@ def circle(tmp_path: Path) -> Path:
 
 
 def said(examined: LogCheck, check: str) -> str:
-    """All lines about a subject, which are one line each."""
+    """All lines about a subject."""
     lines = [str(finding) for finding in examined.findings if finding.check == check]
     assert all("\n" not in line for line in lines)
     return "\n".join(lines)
@@ -52,7 +52,7 @@ def replaced(column: int, value: Callable[[str], object]) -> Callable[[Rows], li
     return lambda rows: joined([[*row[:column], str(value(row[column])), *row[column + 1 :]] for row in rows])
 
 
-WRONG = {  # a file, what is changed in it, the sensor, and what is said of it
+WRONG = {  # file, change, sensor, message
     "a gap": (
         "gps.csv",
         lambda rows: joined(rows[:5] + rows[60:]),
@@ -169,7 +169,7 @@ TIMES = np.arange(0.0, 120.0, 0.1)
 
 
 def driven(seed: int = 3) -> np.ndarray:
-    """The distance of a drive that changes its speed every 4 s."""
+    """Distance of a drive with a new speed every 4 s."""
     speeds = np.repeat(np.random.default_rng(seed).choice([0.0, 1.0, 3.0, 5.0], len(TIMES) // 40), 40)
     return np.cumsum(speeds) * 0.1
 
@@ -196,7 +196,7 @@ def test_a_machine_that_stands_and_a_short_log_show_nothing() -> None:
 
 
 def test_ticks_and_speeds_are_the_same_way() -> None:
-    """Also backwards: it is the way, not the place."""
+    """In reverse too: distance, not position."""
     encoder = SensorConfig("ticks", "encoder", ticks_per_rev=100)
     machine = MachineConfig("m", wheel_radius_m=0.5, sensors=(encoder,))
     per_tick_m = 2 * math.pi * 0.5 / 100

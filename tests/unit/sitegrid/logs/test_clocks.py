@@ -1,4 +1,4 @@
-"""Clocks of a recording that are apart: measured by the motion, named with a `delay_s` that mends them, or not told."""
+"""Clock offsets in a recording: measured by motion and named with a correcting `delay_s`, or unknown."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STEADY = (Leg(4, 0.5), Leg(116))
 
 
 def work(seed: int, seconds: float = 150.0) -> tuple[Leg, ...]:
-    """Starts, stops and bends of no fixed length."""
+    """Irregular starts, stops and bends."""
     rng, legs, speed_mps, left_s = np.random.default_rng(seed), [], 0.0, seconds
     while left_s > 0:
         length_s, wanted_mps = float(rng.integers(4, 11)), float(rng.choice([0.0, 1.5, 3.0, 4.5]))
@@ -37,7 +37,7 @@ def work(seed: int, seconds: float = 150.0) -> tuple[Leg, ...]:
 
 @cache
 def recorded(legs: tuple[Leg, ...], seed: int = 0) -> list[Reading]:
-    """A drive with fixes that err by 0.7 m, and gyros with noise."""
+    """A drive with 0.7 m fix errors and gyro noise."""
     rng = np.random.default_rng(seed)
     readings = noisy(thinned(drive(legs, VEHICLE).readings), seed)
     off_deg = rng.normal(0, 0.7 / 111_200, (len(readings), 2))
@@ -48,7 +48,7 @@ def recorded(legs: tuple[Leg, ...], seed: int = 0) -> list[Reading]:
 
 
 def log_of(folder: Path, readings: list[Reading], **ahead_s: float) -> Path:
-    """A log in which the clocks of some sensors are ahead."""
+    """A log with some sensors' clocks ahead."""
     made = [replace(r, stamp_ns=r.stamp_ns + round(ahead_s.get(key(r.sensor), 0.0) * 1e9)) for r in readings]
     names = {reading.sensor for reading in made}
     vehicle = replace(VEHICLE, sensors=tuple(s for s in VEHICLE.sensors if s.name in names))
@@ -65,7 +65,7 @@ def without(*sensors: str, legs: tuple[Leg, ...]) -> list[Reading]:
 
 
 def proposed(folder: Path) -> dict[str, float]:
-    """What the check proposes, by sensor; each in one line that names the sensor and what to write."""
+    """Proposals by sensor, each in one line with the manifest entry."""
     delays_s: dict[str, float] = {}
     for finding in examine(folder).findings:
         if match := re.search(r"; write `delay_s = (-?[\d.]+)` under its name \(\+- [\d.]+ s\)$", str(finding)):
@@ -84,7 +84,7 @@ def mend(folder: Path, delays_s: dict[str, float]) -> None:
 
 
 def replayed(folder: Path) -> tuple[Row, list[str]]:
-    """The row of a replay, and what was said meanwhile."""
+    """A replay's row, and messages."""
     said: list[str] = []
     report = run(read_recording(folder, None), LocalisationConfig("ekf"), [None], on_progress=said.append)
     assert all(any(clock in line for line in said) for clock in report["clocks"])
@@ -108,7 +108,7 @@ APART = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", by_night(APART, day=("leap seconds", "a slow gyro", "early wheels")))
 def test_an_offset_is_proposed_and_mends_the_log(tmp_path: Path, case: str) -> None:
-    """Of most sensors against the least: where wheels and gyro are as many, the receiver is set to them."""
+    """The minority is set to the majority; on a tie of wheels and gyro, the receiver is set."""
     ahead_s = APART[case]
     log_of(tmp_path, without("gps-2", legs=work(1)), **ahead_s)
     expected = ahead_s if len(ahead_s) < 3 else {"gps_1": 1.7e9}
@@ -136,7 +136,7 @@ def test_a_sound_log_has_no_proposal(tmp_path: Path, seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("ahead_s", [5.0, 4 * DAY])
 def test_a_steady_drive_tells_no_offset(tmp_path: Path, ahead_s: float) -> None:
-    """Stamps that do not overlap are named all the same."""
+    """Stamps without overlap are named anyway."""
     log_of(tmp_path, without("gps-2", legs=STEADY), gps_1=ahead_s)
     lines = [str(finding) for finding in examine(tmp_path).findings if finding.check == "gps-1"]
     assert proposed(tmp_path) == {}
@@ -146,7 +146,7 @@ def test_a_steady_drive_tells_no_offset(tmp_path: Path, ahead_s: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("ahead_s", "is_located"), by_night([(18.0, True), (1.7e9, False)], day=[(1.7e9, False)]))
 def test_with_what_is_proposed_positions_are_as_good_as_ever(tmp_path: Path, ahead_s: float, is_located: bool) -> None:
-    """Before, they are far off, or there are none; either way the replay says why."""
+    """Before, positions are far off or missing; the replay says why."""
 
     legs = work(1, 80.0)
     made = drive(legs, VEHICLE)

@@ -1,4 +1,4 @@
-"""Consistency on Gaussian errors whose answer is known."""
+"""Consistency of Gaussian errors with known answers."""
 
 import math
 
@@ -13,7 +13,7 @@ COVARIANCE = np.array([[4.0, 1.2], [1.2, 1.0]])
 
 
 def drawn(n: int, scale: float = 1.0, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of COVARIANCE times scale squared, and covariances that say COVARIANCE."""
+    """Errors of COVARIANCE times scale squared, with stated COVARIANCE."""
     errors = np.random.default_rng(seed).multivariate_normal([0, 0], COVARIANCE * scale**2, n)
     return errors, np.broadcast_to(COVARIANCE, (n, 2, 2))
 
@@ -31,7 +31,7 @@ def is_consistent(summary: ConsistencySummary) -> bool:
 def test_normalised_square_is_the_squared_mahalanobis_distance():
     covariances = np.array([np.diag([4.0, 9.0]), [[2.0, 1.0], [1.0, 2.0]]])
     assert normalised_square(np.array([[2.0, 3.0], [1.0, 1.0]]), covariances) == pytest.approx([2.0, 2 / 3])
-    assert normalised_square(np.array([[3.0]]), np.array([[[4.0]]])) == pytest.approx([2.25])  # of one component
+    assert normalised_square(np.array([[3.0]]), np.array([[[4.0]]])) == pytest.approx([2.25])  # one component
 
 
 @pytest.mark.parametrize(("scale", "mean", "coverage"), [(1.2, 2.88, 0.875), (0.8, 1.28, 0.9907), (2.0, 8.0, 0.527)])
@@ -46,7 +46,7 @@ def test_a_wrong_sigma_shows(scale: float, mean: float, coverage: float):
 def test_limits_are_those_of_the_tables():
     assert consistency.ellipse_limit(2) == pytest.approx(5.991, abs=1e-3)
     assert consistency.ellipse_limit(3) == pytest.approx(7.815, abs=1e-3)
-    low, high = consistency.mean_interval(2, 50)  # chi-square with 100 degrees of freedom: 74.222 to 129.561
+    low, high = consistency.mean_interval(2, 50)  # chi-square, 100 degrees of freedom: 74.222 to 129.561
     assert (low, high) == (pytest.approx(74.222 / 50, abs=1e-3), pytest.approx(129.561 / 50, abs=1e-3))
 
 

@@ -1,4 +1,4 @@
-"""Ground that a log shows against areas where it is known."""
+"""A log's ground against known areas."""
 
 import math
 from dataclasses import replace
@@ -30,7 +30,7 @@ def samples(*places: tuple[float, float]):
 
 
 def test_samples_that_are_surely_inside_are_compared_with_what_is_known_of_an_area() -> None:
-    """The third is inside by less than its standard deviation, the fourth outside; the second is another pass."""
+    """The third is inside by less than its standard deviation, the fourth outside, the second another pass."""
     rows = samples((5, 5), (2, 8), (0.4, 5), (12, 5))
     rows["c_rr"][1], rows["distance_m"][1], rows["stamp_ns"][1] = 0.06, 1.0, 60 * 10**9
     resistance, gradient = compare(rows, [PAD])

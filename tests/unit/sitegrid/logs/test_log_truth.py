@@ -1,4 +1,4 @@
-"""The truth of a log: in metres or degrees, of another point of the machine, with gaps, and as it must not be."""
+"""A log's truth: metres or degrees, another point, gaps, and errors."""
 
 import math
 from dataclasses import replace
@@ -55,7 +55,7 @@ def test_between_rows_that_are_far_apart_nothing_is_known(tmp_path: Path) -> Non
 
 
 def test_rows_that_do_not_count_are_no_truth(tmp_path: Path) -> None:
-    """A reference says in a column of its own how good it is."""
+    """A reference states its quality in a column."""
     rows = "t,x,y,fix\n0,0,0,4\n1,900,900,1\n2,2,0,4\n"
     truth = truth_of(tmp_path, rows, METRES + "\nat_least = { fix = 4 }")
     assert at(truth, 1.0) == [[1.0, 0.0]]
@@ -63,7 +63,7 @@ def test_rows_that_do_not_count_are_no_truth(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("heading", [0.0, math.pi / 2, 2.5])
 def test_the_track_of_an_antenna_is_compared_with_where_the_machine_believes_it(heading: float, tmp_path: Path) -> None:
-    """Ahead and to the left of base_link: a pose that is right has no error, at any heading."""
+    """Ahead and left of base_link: a right pose has no error at any heading."""
     lever = np.array([2.0, 0.5])
     turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
     base = np.array([[0.1 * i, -0.2 * i] for i in range(50)])

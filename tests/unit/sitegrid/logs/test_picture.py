@@ -1,4 +1,4 @@
-"""The picture of a replayed log: what is in it, and where."""
+"""The picture of a replayed log: contents and places."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ def trace(error_m: float = 0.0, n: int = 400) -> Trace:
 
 
 def colours(image: np.ndarray) -> set[tuple[int, ...]]:
-    """Of the ground, without the legend."""
+    """Colours without the legend."""
     numbers = np.unique(image[66:-52, 84:-200].astype(int) @ [1, 256, 256**2])
     return {(n % 256, n // 256 % 256, n // 256**2) for n in numbers.tolist()}
 
@@ -52,7 +52,7 @@ def test_truth_and_withheld_fixes_have_colours_of_their_own(recording: Recording
 
 
 def test_an_ellipse_is_as_large_as_its_covariance_says(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one pose, with standard deviations of 4 m to the east and 1 m to the north."""
+    """One pose with standard deviations of 4 m east, 1 m north."""
     drawn: list[tuple[list[int], float]] = []
     monkeypatch.setattr(cv2, "ellipse", lambda *words, **_: drawn.append((words[2], words[3])))
     one = trace(n=1)

@@ -1,4 +1,4 @@
-"""Replay and score on beliefs whose errors are known."""
+"""Replay and score of beliefs with known errors."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ START_NS = 1_767_225_600_000_000_000
 
 
 def trace_of(error_m: Sequence[tuple[float, float]], std_m: float = 1.0, before: int = 0) -> tuple[Trace, Truth]:
-    """One belief per step beside a truth that drives east with 1 m/s, after steps without one."""
+    """One belief per step beside an eastward truth at 1 m/s, after `before` empty steps."""
     n = len(error_m)
     stamps = START_NS + (np.arange(before + n + 1)) * STEP_NS
     true = np.stack([np.arange(before + n + 1) * 0.1, np.zeros(before + n + 1)], axis=1)
@@ -28,7 +28,7 @@ def trace_of(error_m: Sequence[tuple[float, float]], std_m: float = 1.0, before:
 
 
 class Scripted:
-    """Stands in for the pipeline: has a pose from the second reading on, at the reading's own stamp."""
+    """A pipeline stand-in with poses from the second reading on, at the readings' stamps."""
 
     def __init__(self) -> None:
         self.spans: list[list[Reading]] = []
@@ -56,7 +56,7 @@ def test_time_without_a_pose_is_stated_and_not_counted_as_error():
 
 
 def poses_at(times_s: Sequence[float], seconds: float) -> Trace:
-    """Poses at these times of readings that last so long."""
+    """Poses at these times, and the readings' duration."""
     stamps, n = START_NS + np.round(np.array(times_s) * 1e9).astype(np.int64), len(times_s)
     return Trace(
         stamps, np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros(n), START_NS, START_NS + round(seconds * 1e9), 0.0

@@ -1,4 +1,4 @@
-"""Replays of logs: withheld fixes, truth, choice of sensors; made-up logs, and real ones where they are at hand."""
+"""Replays of synthetic and real logs: withheld fixes, truth, choice of sensors."""
 
 import math
 from functools import partial
@@ -54,7 +54,7 @@ RADIUS_M, RATE_RADPS = 20.0, 0.1
 
 
 def at(t: float, off_m: float = 0.0) -> tuple[float, float]:
-    """On a circle about (100, 50), and off_m to the east of it."""
+    """On a circle about (100, 50), off_m further east."""
     return 100 + RADIUS_M * math.cos(RATE_RADPS * t) + off_m, 50 + RADIUS_M * math.sin(RATE_RADPS * t)
 
 
@@ -64,7 +64,7 @@ def write(path: Path, names: str, rows: list[tuple[float, ...]]) -> None:
 
 @pytest.fixture
 def circle(tmp_path: Path) -> Path:
-    """A log of 100 s whose GPS is 2 m too far to the east: truth and fixes disagree by that."""
+    """A log of 100 s with GPS 2 m too far east: truth and fixes differ by that."""
     times = np.arange(0, 100, 0.1)
     write(tmp_path / "odom.csv", "t,v,w", [(t, RADIUS_M * RATE_RADPS, RATE_RADPS) for t in times])
     write(tmp_path / "truth.csv", "t,east,north", [(t, *at(t)) for t in times])
@@ -102,7 +102,7 @@ def test_errors_against_fixes_and_against_truth_stand_apart(circle: Path):
 
 @pytest.mark.slow
 def test_an_outage_is_placed_and_judged_wherever_it_is(circle: Path):
-    """Wheels that are a tenth too large: the error grows with the time without fixes."""
+    """Wheels a tenth too large: the error grows without fixes."""
     rows = (circle / "odom.csv").read_text().splitlines()
     grown = [
         line.replace(f",{RADIUS_M * RATE_RADPS:.6f},", f",{RADIUS_M * RATE_RADPS * (1.1 if i > 300 else 1):.6f},")
@@ -165,7 +165,7 @@ def test_what_cannot_be_chosen_is_refused_in_one_line(circle: Path, choice: dict
 
 
 def beside(folder: str) -> Path:
-    """The data of a real log, where it is at hand."""
+    """A real log's data, if at hand."""
     if not (DATA / folder).is_dir():
         pytest.skip(f"the log is not beside the project (../shared/data/{folder})")
     return DATA / folder

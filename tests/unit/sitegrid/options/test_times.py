@@ -1,5 +1,3 @@
-"""Times on the command line."""
-
 from __future__ import annotations
 
 from argparse import ArgumentTypeError
@@ -20,7 +18,7 @@ S = 10**9
 @pytest.mark.parametrize(
     ("text", "ns"),
     [
-        ("2025-06-15T15:06:40", T0),  # without a zone: UTC
+        ("2025-06-15T15:06:40", T0),  # default zone UTC
         ("2025-06-15 15:06:40Z", T0),
         ("2025-06-15T17:06:40+02:00", T0),
         ("2025-06-15T15:06:40.000001", T0 + 1000),

@@ -1,4 +1,4 @@
-"""The true map, cut to the cells of a region; what a picture says of itself."""
+"""The true map cut to a region; titles of pictures."""
 
 from __future__ import annotations
 

@@ -38,14 +38,14 @@ def recorded_rows(seed: int) -> Table:
     rows["stamp_ns"] = 1_767_225_600_000_000_000 + np.arange(N) * 10**9
     rows["x_m"], rows["y_m"] = draw.uniform(-40, 40, (2, N))
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = draw.uniform(0.1, 2.0, N)
-    rows["cov_xx_m2"][::20] = 25.0  # too uncertain of their position to vote
+    rows["cov_xx_m2"][::20] = 25.0  # too uncertain to vote
     rows["distance_m"], rows["c_rr"] = draw.uniform(0.5, 1.5, N), draw.uniform(0.005, 0.3, N)
     return rows
 
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory) -> tuple[Path, dict[str, Path]]:
-    """The store and the audit files of a run in which nothing went wrong."""
+    """Store and audit files of a faultless run."""
     folder = tmp_path_factory.mktemp("run")
     store, audits = Store(JournalLocation(folder / "store"), SITE, CONFIG, time.time_ns), {}
     for seed, (machine, spool) in enumerate(SPOOLS.items()):
@@ -54,7 +54,7 @@ def clean(tmp_path_factory) -> tuple[Path, dict[str, Path]]:
         log.recorded(spool, 1, rows)
         log.close()
         for first in range(0, N, BATCH):
-            # every batch begins with what was sent before: trimmed, not counted twice
+            # batches overlap: trimmed, not counted twice
             start = max(0, first - 3)
             batch = SampleBatch(machine, spool, start + 1, rows[start : first + BATCH], SITE.frame)
             assert isinstance(store.commit([Incoming(machine, encode_batch(batch))])[0], Ack)
@@ -65,13 +65,12 @@ def clean(tmp_path_factory) -> tuple[Path, dict[str, Path]]:
 
 @pytest.fixture
 def folder(clean, tmp_path) -> Path:
-    """A copy of the clean store."""
     return Path(shutil.copytree(clean[0], tmp_path / "store"))
 
 
 @pytest.fixture
 def run(clean, folder) -> Callable[..., AuditResult]:
-    """Audit a store after doing something to its journal: statements, or rows to be written."""
+    """Audit a store after changing its journal by statements or rows."""
 
     def audit(*changes: str | JournalRow) -> AuditResult:
         with closing(sqlite3.connect(folder / JOURNAL_FILE)) as db, db:
@@ -105,7 +104,7 @@ def test_a_clean_run_has_nothing_lost_and_nothing_double(run):
 def test_samples_dropped_from_a_row_are_lost(run, journal):
     result = run(replace(journal[3], rows=journal[3].rows[:1]))
     assert result.lost == BATCH - 1
-    assert result.double > 0  # the grid has votes that the journal cannot explain
+    assert result.double > 0  # votes without journal rows
     assert result.unrecorded == 0
 
 
@@ -180,7 +179,7 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
     aged = []
     for i, row in enumerate(journal):
         rows = row.rows.copy()
-        rows["x_m"], rows["y_m"] = 8.5, 8.5  # what stays apart is decided cell by cell
+        rows["x_m"], rows["y_m"] = 8.5, 8.5  # merging is decided by cell
         rows["stamp_ns"] += i * 5 * 3600 * 10**9
         aged.append(replace(row, rows=rows))
     whole, less = grid_of(aged).state(), grid_of(aged[1:]).state()

@@ -1,4 +1,4 @@
-"""Maps against the truth: all known cells, and those where machines truly drove."""
+"""Maps against the truth: all known cells, and truly driven ones."""
 
 import math
 from pathlib import Path
@@ -18,7 +18,7 @@ NAN = np.nan
 
 
 def region(resistance, east=0.0, north=0.0, west_m: float = 100.0) -> Region:
-    """Slopes are unknown where the resistance is."""
+    """Slopes are unknown where resistance is."""
     values = np.array(resistance, np.float32)
     slopes = (np.where(np.isfinite(values), np.float32(slope), np.float32(NAN)) for slope in (east, north))
     layers = dict(zip(("resistance", "grade_east", "grade_north"), (values, *slopes), strict=True))
@@ -39,7 +39,7 @@ def test_wrong_cells_are_counted_among_the_known():
     result = score(estimated, truth)
     assert result.cells == 5
     assert result.wrong_resistance_pct == pytest.approx(20.0)  # 0.04 is dry dirt, 0.06 wet dirt
-    assert result.wrong_grade_pct == pytest.approx(20.0)  # a slope missed; one turned round is still a slope
+    assert result.wrong_grade_pct == pytest.approx(20.0)  # a missed slope; a reversed one is still a slope
 
 
 def test_a_perfect_map_scores_zero_and_an_unknown_one_has_no_score():
@@ -70,7 +70,7 @@ def test_tracks_beyond_the_region_are_cut_and_those_of_all_machines_count():
 
 
 def test_only_cells_that_were_truly_driven_count():
-    """Row 1 was never driven: its wrong cells are the position's fault."""
+    """Row 1 was never driven: position errors."""
     result = score_driven(region([[0.04, 0.04, 0.06, 0.06, NAN, 0.06], [0.25] * 6]), TRUE, ROW_0)
     assert (result.cells, result.wrong_grade_pct) == (6, 0.0)
     assert result.known_pct == pytest.approx(100 * 5 / 6)
@@ -88,7 +88,7 @@ def test_cells_without_truth_do_not_count():
     whole, driven = score(estimated, truth), score_driven(estimated, truth, ROW_0)
     assert (whole.wrong_resistance_pct, whole.wrong_grade_pct) == (50.0, 0.0)
     assert (driven.cells, driven.wrong_resistance_pct) == (2, 50.0)
-    assert driven.by_border[-1]["cells"] == 2  # what is not known is no border
+    assert driven.by_border[-1]["cells"] == 2  # unknown is no border
 
 
 def test_root_mean_square_of_nothing_is_not_known():
@@ -105,7 +105,7 @@ def pose(name: str, seconds: float, x_m: float, y_m: float) -> Pose:
 
 @pytest.fixture
 def truth(tmp_path: Path) -> Path:
-    """Machine `a` drives east with 2 m/s, machine `b` stands at (5, -5)."""
+    """Machine `a` drives east at 2 m/s, machine `b` stands at (5, -5)."""
     (tmp_path / "tracks").mkdir()
     for name, place in (("a", lambda t: (2.0 * t, 0.0)), ("b", lambda _: (5.0, -5.0))):
         lines = [f"{START_NS + t * 10**9},{place(t)[0]},{place(t)[1]}" for t in range(11)]

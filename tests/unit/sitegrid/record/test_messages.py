@@ -1,4 +1,4 @@
-"""What Foxglove shows is what the site said: places, transforms, grids; and what JSON does not know is refused."""
+"""Foxglove shows what the site said: places, transforms, grids; JSON limits are refused."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ POSE = Pose("loader-1", 1_700_000_000_123_456_789, 120.5, -30.25, 2.5, 3.5, 0.04
 
 
 def recorded(path: Path, said: SiteMessage) -> dict:
-    """The message as a reader finds it, fit for its schema."""
+    """The message as read back, valid by its schema."""
     recording = Recording(path, {})
     said.record(recording, 1)
     recording.finish()

@@ -1,4 +1,4 @@
-"""Bundles of recorded readings: an agent gets the readings in the order in which the first one took them."""
+"""Bundles of recorded readings keep the order in which the agent took them."""
 
 from __future__ import annotations
 

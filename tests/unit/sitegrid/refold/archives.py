@@ -1,4 +1,4 @@
-"""Archives for tests of folds: files of samples anywhere, of any time, with weights that counts cannot hold."""
+"""Archives for fold tests: samples anywhere and any time, with overflowing weights."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ S = 10**9
 
 
 def samples(rng: np.random.Generator, n: int, *, days: float = 2.0, heavy: bool = False) -> Table:
-    """Samples around the corner of four tiles; heavy: many at one place, each of 100 m."""
+    """Samples around the corner of four tiles; heavy: many at one place, 100 m each."""
     rows = empty(n)
     rows["stamp_ns"] = T0 + np.sort(rng.integers(0, int(days * 86_400 * S), n))
     for name in ("x_m", "y_m"):
@@ -43,7 +43,6 @@ def samples(rng: np.random.Generator, n: int, *, days: float = 2.0, heavy: bool 
 
 
 def write(folder: Path, rows: Sequence[JournalRow]) -> FilePart:
-    """One file of an archive."""
     path = write_file(folder, STORE, SITE, ((row, row.received_ns) for row in rows))
     assert path
     return FilePart(path)
@@ -52,7 +51,7 @@ def write(folder: Path, rows: Sequence[JournalRow]) -> FilePart:
 def fold_in(
     folder: Path, config: FoldConfig | None = None, selection: Selection = ALL, site: SiteConfig = SITE
 ) -> Fold:
-    """What the tasks of a fold have in common, in a folder that is there."""
+    """Common part of a fold's tasks in a folder."""
     folder.mkdir(exist_ok=True)
     (folder / STORE_FILE).write_text(STORE)
     return Fold(folder, STORE, site, config or ServerConfig().fold, selection, UNCORRECTED, code_digest())

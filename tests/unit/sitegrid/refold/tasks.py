@@ -1,4 +1,4 @@
-"""Tasks for engines: who does them is another process, which finds them by the name of this module."""
+"""Tasks for engines, found by this module's name in other processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def square(number: int) -> tuple[int, int]:
 
 
 def die_once(marker: Path) -> int:
-    """Be killed, but for the second time."""
+    """Die the first time."""
     if not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)

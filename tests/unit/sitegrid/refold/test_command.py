@@ -1,4 +1,4 @@
-"""Archives and stores are folded again with other parameters."""
+"""Refolding of archives and stores with other parameters."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ BATCH = 20
 
 
 def track(seed: int, n: int = 120) -> Table:
-    """One sample every ten seconds, on a walk."""
+    """One sample every ten seconds on a walk."""
     draw = np.random.default_rng(seed)
     rows = empty(n)
     rows["stamp_ns"] = T0 + 10 * S * np.arange(n)
@@ -79,7 +79,7 @@ def make_store(
     archived: float = 0,
     changed: int | None = None,
 ) -> Path:
-    """A store of these machines, a batch an hour; what came in the first `archived` hours is in its archive."""
+    """A store with hourly batches; those of the first `archived` hours are archived."""
     clock = [T0]
     store = Store(JournalLocation(folder), site, ServerConfig(), lambda: clock[0])
     for first in range(0, 120, batch):
@@ -102,7 +102,7 @@ def run(*words: object) -> int:
 
 
 def opened(folder: Path) -> Store:
-    """As `sitegrid server` opens it."""
+    """As opened by `sitegrid server`."""
     config = from_table(ServerConfig, load_toml(folder / "server.toml"), "server.toml")
     return Store(JournalLocation(folder), load_site(folder / "site.toml"), config, time.time_ns)
 
@@ -127,7 +127,7 @@ def folded(
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three machines, two hours archived, four in the journal. Nothing writes to it."""
+    """Three machines, two hours archived, four journalled. Read-only."""
     return make_store(tmp_path_factory.mktemp("made") / "store", archived=2)
 
 
@@ -137,7 +137,7 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     assert identities(tmp_path / "new") == identities(store)
     again = opened(tmp_path / "new")
     assert same_evidence(again.grid, folded())
-    assert again.snapshot_row == again.journalled == again.merged == 18  # it starts from a snapshot
+    assert again.snapshot_row == again.journalled == again.merged == 18  # starts from a snapshot
     with SqliteReader(store / JOURNAL_FILE) as reader:
         assert again.journal.watermarks() == reader.watermarks()
         old = reader.identity()
@@ -155,7 +155,7 @@ FACTS = [
 
 
 def decide(store: Path) -> Grid:
-    """Have corrections with a store, as its server decides them; returns its map."""
+    """Add corrections to a store like its server; returns its map."""
     with closing(Store(JournalLocation(store), SITE, ServerConfig(), time.time_ns)) as opened_store:
         for decision in FACTS:
             opened_store.decide(decision)
@@ -180,7 +180,7 @@ def test_corrections_go_with_the_samples_and_the_map_is_the_live_one(tmp_path: P
 
 
 def test_a_copy_of_a_history_that_is_behind_brings_nothing_back():
-    """Of two stores, with the archive of the second as it was, and a store that was folded of both and went on."""
+    """Two stores, the second one's outdated archive, and a continued refold of both."""
 
     def decided(machine: str, zero: float) -> CalibrationDecision:
         correction = Correction(machine, 0, LAST_NS, zero, 0.0, 0.0, ())
@@ -235,7 +235,7 @@ def test_a_store_lists_all_that_it_descends_from(store: Path, tmp_path: Path):
     with closing(Store(JournalLocation(tmp_path / "copy"), SITE, ServerConfig(), time.time_ns)) as first:
         first.accept(gone, "its disk died")
         old = first.identity.id
-    assert run(store / "archive", "--out", tmp_path / "files") == 0  # files alone say which store they are of
+    assert run(store / "archive", "--out", tmp_path / "files") == 0  # files alone name their store
     assert run(tmp_path / "files", tmp_path / "copy", "--out", tmp_path / "new") == 0
     with closing(opened(tmp_path / "files")) as files, closing(opened(tmp_path / "new")) as new:
         assert files.identity.descends == (old,)
@@ -294,7 +294,7 @@ def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsy
 
 
 def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, capsys):
-    """Also where batches were cut differently, and where a file is named twice."""
+    """Even if batches were cut differently, or a file is named twice."""
     other = make_store(tmp_path / "other", "ab", batch=30, archived=1)
     file = min((store / FOLDER).glob("*.parquet"))
     assert run(store, other, file, file, "--out", tmp_path / "new", "--json") == 0
@@ -312,7 +312,7 @@ def test_the_same_sample_with_another_content_is_named(store: Path, tmp_path: Pa
     assert run(store, other, "--out", tmp_path / "new") == 1
     error = capsys.readouterr().err
     assert "sample 77 of b, spool 0000000000000007, is another in a further archive" in error
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["other"]  # nothing half-made is left
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other"]  # nothing incomplete is left
     assert run(store, other, "--out", tmp_path / "new", "--without", "b") == 0
 
 
@@ -383,7 +383,7 @@ def test_what_is_no_archive_is_refused(store: Path, tmp_path: Path, capsys):
 @pytest.mark.processes
 @pytest.mark.parametrize("jobs", [pytest.param(2), pytest.param(50, marks=pytest.mark.nightly)])
 def test_processes_fold_a_store_as_one_does(store: Path, tmp_path: Path, jobs: int):
-    """Also more of them than there are files; the rest of the journal is a part of its own."""
+    """Even with more processes than files; the rest of the journal is a part."""
     assert run(store, "--out", tmp_path / "new", "--jobs", jobs, "--without", "b") == 0
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
     again = opened(tmp_path / "new")
@@ -400,7 +400,7 @@ def test_a_port_that_says_nothing_is_no_scheduler(store: Path, tmp_path: Path, c
 
 
 def test_archives_elsewhere_are_folded(store: Path, tmp_path: Path):
-    """In the memory of this process, as an example of all that fsspec reaches; with what was decided about them."""
+    """In process memory, as an example of fsspec, with decisions."""
     source = make_store(tmp_path / "source", archived=9)
     live = decide(source)
     files = fsspec.filesystem("memory")
@@ -460,7 +460,7 @@ def test_decisions_count_in_the_order_of_their_stamps_however_archives_are_given
     histories = (first, second, joined_decisions([second, first]))
     for order in permutations(histories):
         assert [decision.corrections[0].zero for decision in joined_decisions(order)] == [0.001, 0.002, 0.003]
-    went_back = [decided(0.004, 20), decided(0.005, 2)]  # the site's clock did
+    went_back = [decided(0.004, 20), decided(0.005, 2)]  # of the site's clock
     assert joined_decisions([went_back, first])[-2:] == went_back
 
 

@@ -1,4 +1,4 @@
-"""Tasks are done by processes, also where these die, hang or fail; they end with who started them."""
+"""Tasks in processes that may die, hang or fail, and that end with their parent."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 
 
 def running() -> list[int]:
-    """Children that run: multiprocessing keeps one as active that another thread of it has waited for."""
+    """Running children: multiprocessing lists ones already awaited by other threads."""
     return [child.pid for child in multiprocessing.active_children() if child.pid and _runs(child.pid)]
 
 
@@ -67,7 +67,7 @@ def test_an_error_of_a_task_is_that_of_the_work() -> None:
 
 
 def test_processes_end_with_who_started_them() -> None:
-    """Killed, it cannot end them itself."""
+    """A killed parent cannot end them."""
     code = (
         "import multiprocessing, time; from sitegrid.refold.engine import Cluster\n"
         "from tests.unit.sitegrid.refold.tasks import square\n"

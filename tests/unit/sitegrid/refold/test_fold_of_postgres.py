@@ -1,4 +1,4 @@
-"""A journal in PostgreSQL is folded as a store is, also while a server writes it."""
+"""A PostgreSQL journal is folded like a store, even while in use."""
 
 from __future__ import annotations
 

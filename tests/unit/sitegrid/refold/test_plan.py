@@ -1,4 +1,4 @@
-"""Each sample is folded once, whichever archives have it; one that differs is named; rows are cut where they must."""
+"""Every sample is folded once whatever archives have it; differing ones are named; rows are cut."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ENGINE = Here(1)
 
 
 def kept_of(planned: Plan) -> list[tuple[str, int, int]]:
-    """Every kept sample, as often as it is kept."""
+    """Every kept sample, with repetitions."""
     return [
         (*spool, seq)
         for each in planned.contents
@@ -31,7 +31,7 @@ def kept_of(planned: Plan) -> list[tuple[str, int, int]]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_each_sample_is_kept_once_however_archives_overlap(seed: int, tmp_path: Path) -> None:
-    """Archives that have stretches of the same spools, in batches that were cut otherwise."""
+    """Archives that share stretches of spools, in differently cut batches."""
     rng = np.random.default_rng(seed)
     drives = {(name, spool): samples(rng, 60) for name in "ab" for spool in (1, 2**64 - 1)}
     parts, have = [], set()
@@ -55,7 +55,7 @@ def test_each_sample_is_kept_once_however_archives_overlap(seed: int, tmp_path: 
     again = plan(parts[::-1], ALL, ENGINE)
     assert [(c.part, c.intervals) for c in again.contents] == [(c.part, c.intervals) for c in planned.contents]
     row = 1
-    for each, taken in zip(planned.contents, planned.taken, strict=True):  # what is planned is what is folded
+    for each, taken in zip(planned.contents, planned.taken, strict=True):  # the plan equals the fold
         work = PartWork(each.part, "", each.first_ns, row, each.rows, each.samples, tuple(taken.items()))
         if each.rows:
             fold_parts(FoldTask(fold_in(tmp_path / "work"), (work,), 1))

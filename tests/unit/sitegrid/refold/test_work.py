@@ -1,4 +1,4 @@
-"""Tasks by file and by tile come to the fold of all samples, bit for bit."""
+"""Tasks by file and tile give the fold of all samples, bit for bit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONFIGS = (FoldConfig(), FoldConfig(keep_buckets=1, keep_hours=1, keep_days=1), 
 
 
 def split(rng: np.random.Generator, folder: Path, *, heavy: bool) -> tuple[list[JournalRow], list[list[JournalRow]]]:
-    """Rows of three machines, and the same in files, at random."""
+    """Rows of three machines, and the same in random files."""
     rows = [
         JournalRow(
             number, f"m{rng.integers(3)}", number, 1, samples(rng, int(rng.integers(1, 40)), heavy=heavy), number
@@ -41,7 +41,7 @@ def task_of(fold: Fold, parts: list[PartWork]) -> FoldTask:
 
 
 def works(folder: Path, files: list[list[JournalRow]], selection: Selection = ALL) -> list[PartWork]:
-    """Files as parts, numbered one behind the other."""
+    """Consecutively numbered parts."""
     parts, row = [], 1
     for number, rows in enumerate(files):
         held = look(LookTask(write(folder / str(number), rows), selection))
@@ -51,7 +51,7 @@ def works(folder: Path, files: list[list[JournalRow]], selection: Selection = AL
 
 
 def state_of(fold: Fold, tasks: list[FoldTask]) -> GridState:
-    """What tasks come to, by tiles."""
+    """Result of tasks by tile."""
     for task in tasks:
         fold_parts(task)
     evidence = [task.evidence for task in tasks]
@@ -69,9 +69,9 @@ def folded(rows: list[JournalRow], cell_m: float, config: FoldConfig) -> GridSta
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(6))  # each kind of cell and config, and heavy samples
+@pytest.mark.parametrize("seed", range(6))  # all kinds of cell and config, heavy samples
 def test_any_split_and_any_tiles_come_to_the_fold_of_all(seed: int, tmp_path: Path, monkeypatch) -> None:
-    """With stencils that are larger than a tile (16 cells, or 0.8 m), and counts beyond 16 and 32 bits."""
+    """With stencils larger than a tile (16 cells, or 0.8 m), and counts beyond 16 and 32 bits."""
     rng = np.random.default_rng(seed)
     monkeypatch.setattr(work, "LEAST_TILE", 1)
     monkeypatch.setattr(work, "MERGED_AT_ONCE", int(rng.integers(1, 4)))

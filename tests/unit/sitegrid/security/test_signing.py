@@ -1,4 +1,4 @@
-"""Signatures of batches: only the machine's own, for its own key, over the very bytes."""
+"""Batch signatures: the machine's own, for its own key, over the exact bytes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_batch_without_signature_and_a_machine_without_key_are_told_apart(veri
 
 
 def test_key_and_payload_do_not_run_into_each_other(made, verifier):
-    """The end of the key must not pass for the beginning of the payload."""
+    """The key's end must not pass for the payload's start."""
     signature = signing.Signer(made["loader-1"][0]).sign(KEY, b"0" + BATCH)
     with pytest.raises(MessageError):
         verifier.check("loader-1", KEY + "0", BATCH, signature)
@@ -81,7 +81,7 @@ def server():
 
 def test_a_reply_is_believed_as_the_answer_to_one_batch_of_one_machine(made, server):
     private, public = server
-    verifier = signing.ReplyVerifier([made["loader-1"][1], public])  # of several map servers any may answer
+    verifier = signing.ReplyVerifier([made["loader-1"][1], public])  # any of several map servers may answer
     signature = signing.Signer(private).sign_reply(KEY, BATCH, REPLY)
     assert verifier.is_genuine(KEY, BATCH, REPLY, signature)
     for key, payload, reply in ((f"{KEY}x", BATCH, REPLY), (KEY, BATCH + b"x", REPLY), (KEY, BATCH, b"nak")):
@@ -130,7 +130,7 @@ def test_a_new_token_replaces_the_old_one_and_revoked_ones_count_no_more(tmp_pat
 
 def test_a_file_is_read_again_when_it_changes(tmp_path: Path):
     with pytest.raises(ConfigError, match="sitegrid keys token NAME"):
-        TokenFile(tmp_path)  # nobody has one yet
+        TokenFile(tmp_path)  # no tokens yet
     tokens, token = Tokens().with_new("anna", datetime.now(UTC) + timedelta(days=1))
     save_tokens(tmp_path, tokens)
     file = TokenFile(tmp_path)

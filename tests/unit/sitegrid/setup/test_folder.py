@@ -1,4 +1,4 @@
-"""A folder for one laptop: made of what was heard, read by the readers of agent and server, checked in sentences."""
+"""A laptop's folder: made from what was heard, parsed by agent and server, checked in sentences."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MODEL = ("--model", "truck")
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """Bytes of a receiver, in a file that stands for its port."""
+    """A receiver's bytes in a file, in place of its port."""
     path = tmp_path / "drive.ubx"
     path.write_bytes(b"".join(pvt(second=20 + i) + IMU for i in range(4)))
     return path

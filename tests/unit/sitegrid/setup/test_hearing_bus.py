@@ -1,4 +1,4 @@
-"""What `probe` says of a bus."""
+"""`probe` on a bus."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from tests.unit.agents.drivers.test_can import EEC1, frame
 STATED = [
     EEC1,
     frame(65265, vehicle_speed=3.0),
-    frame(65247),  # nothing in it is available
+    frame(65247),  # no values available
     frame(64000),
     frame(61442, 3, driveline_engaged=1),
 ]
 
 
 def second(*frames: tuple[int, bytes]) -> list[CanFrame]:
-    """These frames, ten times in a second."""
+    """These frames at 10 Hz for a second."""
     return list(chain.from_iterable([CanFrame(i, True, data, 1e9 + n / 10) for i, data in frames] for n in range(11)))
 
 
@@ -46,7 +46,7 @@ def test_what_is_missing_is_named() -> None:
 
 def test_addresses_of_buses_are_taken_as_they_are() -> None:
     assert address_of("virtual://a") == "virtual://a"
-    assert address_of("can7") == "can7"  # also where this host lacks it
+    assert address_of("can7") == "can7"  # even if this host lacks it
     problem = listen("can7", 0.1).problem
     assert problem.startswith(("no such bus: plug the adapter in", "this host's kernel has no SocketCAN: load"))
     assert address_of("udp_multicast://239.0.0.1:5000") == "udp_multicast://239.0.0.1:5000"

@@ -1,4 +1,4 @@
-"""What talks on a port, over real pseudo terminals, sockets, files: it is named, or why it is not, in a sentence."""
+"""Listening on real pseudo terminals, sockets, files: named, or explained in a sentence."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NOISE = random.Random(4).randbytes(200)
 
 @contextmanager
 def repeated(send: Callable[[], object]) -> Iterator[None]:
-    """Send again and again, as a receiver does."""
+    """Send repeatedly, like a receiver."""
     ended = threading.Event()
 
     def run() -> None:
@@ -51,7 +51,7 @@ def repeated(send: Callable[[], object]) -> Iterator[None]:
 
 @contextmanager
 def on_a_port(folder: Path, sent: Callable[[], bytes], baud: int = 0) -> Iterator[str]:
-    """A serial device that sends; at another baud than its own, where it has one, noise comes."""
+    """A sending serial device; noise at any other than its own baud rate."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     os.set_blocking(master, False)
@@ -62,7 +62,7 @@ def on_a_port(folder: Path, sent: Callable[[], bytes], baud: int = 0) -> Iterato
         is_set = baud in (0, termios.tcgetattr(slave)[5])
         try:
             os.write(master, sent() if is_set else NOISE)
-        except BlockingIOError:  # nobody reads yet
+        except BlockingIOError:  # no reader yet
             return
 
     try:

@@ -1,4 +1,4 @@
-"""Answers in pieces: the same JSON, however long; none takes long to make, and all together have room."""
+"""Answers in pieces: the same JSON, quick pieces, bounded room."""
 
 from __future__ import annotations
 

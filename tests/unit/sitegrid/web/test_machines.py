@@ -1,4 +1,4 @@
-"""Machines as pages see them, however many names are made up."""
+"""Machines on pages, under any number of invented names."""
 
 import pytest
 

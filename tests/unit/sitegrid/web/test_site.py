@@ -1,5 +1,3 @@
-"""What all pages of a site share."""
-
 from __future__ import annotations
 
 import asyncio
@@ -14,7 +12,7 @@ def test_nobody_waits_for_machines_once_the_site_was_listened_to_for_long_enough
     async def ask() -> None:
         feed = SiteFeed(SimpleNamespace(site="pit"))
         feed._listens_s = asyncio.get_running_loop().time() - HEARD_S
-        with pytest.raises(StopIteration):  # it ends without having waited
+        with pytest.raises(StopIteration):  # ends without waiting
             feed.heard().send(None)
 
     asyncio.run(ask())

@@ -1,4 +1,4 @@
-"""One visitor's sockets: how many there may be, and how long each may take. Times are short here."""
+"""A visitor's sockets: number and timeouts, shortened here."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _short_times_and_few_places(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def app(scope: Scope, receive: Receive, send: Send) -> None:
-    """Answers a request, or begins to, and takes a WebSocket until it goes."""
+    """Answers, or begins to, and holds WebSockets."""
     if scope["path"] == "/endless":
         await send({"type": "http.response.start", "status": 200, "headers": []})
         await send({"type": "http.response.body", "body": b"1", "more_body": True})
@@ -71,7 +71,7 @@ def opened(listening: Listening, address: str = "127.0.0.1") -> socket.socket:
 
 
 def asked(visitor: socket.socket, request: bytes = WHOLE) -> bytes:
-    """How an answer begins; empty where the connection is closed."""
+    """Start of an answer; empty if closed."""
     try:
         visitor.sendall(request)
         return visitor.recv(1000)[9:12]
@@ -80,7 +80,7 @@ def asked(visitor: socket.socket, request: bytes = WHOLE) -> bytes:
 
 
 def has_ended(visitor: socket.socket, trickle: bytes = b"") -> bool:
-    """Wait until the server closes a connection, and send a byte now and then: it buys no time."""
+    """Wait for the server to close; a trickle of bytes buys no time."""
     visitor.settimeout(PATIENCE_S / 4)
     for _ in range(40):
         try:

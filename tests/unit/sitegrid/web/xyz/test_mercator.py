@@ -15,7 +15,7 @@ def decoded(png: bytes) -> np.ndarray:
 @pytest.mark.parametrize(("lat", "lon"), [(49.01, 8.4), (-16.8, 179.99995), (84.0, -40.0), (-80.0, 179.0)])
 def test_a_tile_of_any_zoom_has_what_the_map_knows_or_nothing(lat: float, lon: float):
     projection, known, ones = Projection(SiteConfig("pit", lat, lon)), Bounds(-50, -50, 50, 50), np.ones((100, 100))
-    world = [(z, x, y) for z in (0, 1) for x in range(2**z) for y in range(2**z)]  # in part beyond the projection
+    world = [(z, x, y) for z in (0, 1) for x in range(2**z) for y in range(2**z)]  # partly beyond the projection
     for place in (*world, (14, *tile_at(lat, lon, 14))):
         pixels = pixels_of(*place, projection)
         shown = pixels.sample(ones, -50, -50, 1.0) == 1

@@ -1,4 +1,4 @@
-"""Tiles of zooms whose pixels are larger than cells, of maps of any size and place; the map is made up here."""
+"""Tiles with pixels larger than cells, on synthetic maps of any size and place."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +16,7 @@ PLACES = [(49.01, 8.4), (-16.8, 179.9998), (70.0, -180.0), (-16.8, -179.9999)]
 
 @dataclass
 class Map:
-    """A client of a map in which cells are known that lie in one of some rectangles, each with its value."""
+    """A client of a map with known rectangles of one value each."""
 
     known: dict[tuple[float, float, float, float], float]
     cell_m: float = 1.0
@@ -34,7 +34,7 @@ class Map:
         ends = (
             (bounds.west_m, bounds.east_m),
             (bounds.south_m, bounds.north_m),
-        )  # widened to whole cells, as a map does
+        )  # widened to whole cells, like a map
         x_m, y_m = ((np.arange(low // edge_m, -(-high // edge_m)) + 0.5) * edge_m for low, high in ends)
         values = np.full((len(y_m), len(x_m)), np.nan, np.float32)
         half = edge_m / 2
