@@ -1,4 +1,4 @@
-"""One machine's process: driver -> pipeline -> spool -> uplink; it publishes pose and health too."""
+"""One machine's process: driver -> pipeline -> spool -> uplink; also publishes pose and health."""
 
 import logging
 import math
@@ -33,13 +33,13 @@ from protocol.wire.owners import Owner
 
 log = logging.getLogger("agents.agent")
 
-EVERY_S = 1.0  # samples are written, and health is shown: a write costs a sync of the disk
-SILENT_S = 10.0  # real time without a new pose after which no smoother's word is waited for: the machine may be off
+EVERY_S = 1.0  # interval of writing samples, each a disk sync, and of showing health
+SILENT_S = 10.0  # real time without a new pose after which the smoother is not awaited: the machine may be off
 
 
 @dataclass(frozen=True)
 class Places:
-    """Files of an agent: its spool, and optionally an audit file and one for the calibration."""
+    """Files of an agent; audit and calibration are optional."""
 
     spool: Path
     audit: Path | None = None
@@ -80,11 +80,11 @@ class Agent:
         self._lane_link = LaneLink(session, site.name) if self._pipeline.lanes else None
         self._unsaved, self._spool_problem = WriteBuffer(), ""
         self._status, self._clocks, self._unsampled = Status(machine), "", ""
-        self._faults: dict[str, str] = {}  # of sensors, as they were last told
+        self._faults: dict[str, str] = {}  # of sensors, as last logged
         self._readings = 0
         self._samples = 0
         self._newest_ns = 0
-        self._heard_s = self._now_s = 0.0  # when the last readings came in, and now
+        self._heard_s = self._now_s = 0.0  # time of the last readings, and now
 
     def run(
         self,
@@ -94,10 +94,7 @@ class Agent:
         wait: Callable[[float], object] = time.sleep,
         show: Callable[[dict[str, Any]], None] = lambda _: None,
     ) -> dict[str, Any]:
-        """Take readings until the stream ends or `is_stopped`; returns a report in plain values.
-
-        show: gets the report each second.
-        """
+        """Process readings until the stream ends or `is_stopped`; returns a report, which `show` gets each second."""
         second_s = moved_s = self._heard_s = clock()
         while not is_stopped():
             readings = driver.read(0.2)
@@ -110,7 +107,7 @@ class Agent:
                 moved_s = clock()
             elif self._pipeline.pose and clock() - moved_s > SILENT_S:
                 self._take(self._pipeline.settle())
-                moved_s = math.inf  # once is enough: without a pose there is no sample
+                moved_s = math.inf  # once: without a pose there is no sample
             if clock() >= second_s:
                 second_s = clock() + EVERY_S
                 self._write()
@@ -168,7 +165,7 @@ class Agent:
         }
 
     def close(self) -> None:
-        """End the uplink, leave the network, close the spool."""
+        """Stop the uplink, leave the network, close the spool."""
         if self._corrections:
             self._corrections.close()
         if self._recorder:
@@ -178,7 +175,7 @@ class Agent:
         self._spool.close()
 
     def _step(self, readings: list[Any]) -> bool:
-        """Take in readings; returns whether they made a new pose."""
+        """Process readings; returns whether the pose is new."""
         self._readings += len(readings)
         if readings:
             self._newest_ns = readings[-1].stamp_ns
@@ -195,13 +192,13 @@ class Agent:
         return pose is not before
 
     def _take(self, made: Samples) -> None:
-        """Have samples written at the end of the second."""
+        """Queue samples for the next write."""
         self._unsaved.add(made.pending, made.final)
         if len(made.pending):
             self._status.sampled()
 
     def _show(self, driver: Driver, show: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-        """Show a report, which it returns, to whoever wants to see it; log why samples are missing, once."""
+        """Publish and return a report; log once why samples are missing."""
         clocks, report = self._clocks, self.report(driver)
         if (why := self._status.unsampled) and not self._unsampled:
             log.warning("samples are missing why=%r", why)
@@ -213,7 +210,7 @@ class Agent:
         return report
 
     def _tell_faults(self) -> None:
-        """Log what is wrong with sensors, as it begins and as it ends."""
+        """Log sensor faults as they begin and end."""
         before, self._faults = self._faults, self._pipeline.faults
         for name, fault in self._faults.items() - before.items():
             log.warning("a sensor does not count sensor=%s why=%r", name, fault)
@@ -221,7 +218,7 @@ class Agent:
             log.info("a sensor counts again sensor=%s", name)
 
     def _write(self) -> None:
-        """Write to the spool; while the disk is full or fails samples wait in memory, and the machine goes on."""
+        """Write to the spool; with a full or failing disk, samples wait in memory."""
         if self._unsaved.is_clean:
             return
         try:
@@ -233,29 +230,28 @@ class Agent:
         self._uplink_thread.wake()
 
     def _consider_offer(self) -> None:
-        """Hand what the map server offers to the calibration, once."""
-        offer, self._uplink.offer = self._uplink.offer, None  # one that comes in between comes again
+        offer, self._uplink.offer = self._uplink.offer, None  # a lost one comes again
         if offer is not None:
             self._pipeline.consider(offer)
 
     def _take_lanes(self) -> None:
-        """Have the newest lanes of the site, for places around the machine; until they come, those from before."""
+        """Use the newest lanes around the machine, else the earlier ones."""
         aid, link = self._pipeline.lanes, self._lane_link
         if aid and link and (lanes := link.look(self._pipeline.pose)):
             aid.lanes = lanes
 
     def _lanes(self) -> dict[str, Any] | None:
-        """What lanes there are, and whether they are used; None where they are not to be."""
+        """State of the lanes; None if unused."""
         aid, link = self._pipeline.lanes, self._lane_link
         return {**aid.report(), "counters": dict(link.counters)} if aid and link else None
 
     def _yield_name(self) -> None:
-        """Send nothing while an earlier agent of the same name runs; the samples wait in the spool."""
+        """Send nothing while an earlier agent of this name runs; samples wait in the spool."""
         rival = self._presence.look_around()
         self._uplink.held = (
             f"another agent of this name runs as {rival}: it sends, this one waits; stop one of them" if rival else ""
         )
 
     def _is_delivered(self) -> bool:
-        self._write()  # samples that are not on disk yet
+        self._write()
         return self._unsaved.is_clean and self._spool.is_settled()

@@ -1,8 +1,8 @@
-"""Constant offsets between the clocks of a machine's sensors, by what each shows of the same motion.
+"""Constant offsets between the clocks of a machine's sensors, by the motion each shows.
 
-Receivers show speed and turn, wheels speed, gyros turn. The clocks of two sensors are apart by the lag at which they
-agree best, of all lags, wherever their stamps are. With the correlation r of a quantity over n independent values, the
-log-likelihood of a lag is -n/2 log(1 - r^2), summed over the quantities that both show; its curvature is the variance.
+Receivers show speed and turn, wheels speed, gyros turn. The offset of two sensors is the lag of best agreement. With
+correlation r of a quantity over n independent values, a lag's log-likelihood is -n/2 log(1 - r^2), summed over shared
+quantities; its curvature gives the variance.
 """
 
 import math
@@ -17,30 +17,27 @@ from protocol.machine.machine_config import ABSOLUTE, BASE, MAX_DELAY_S, MAX_EAR
 from protocol.machine.readings import KINDS, Encoder, Gps, GpsVelocity, Imu, Odometry, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
-STEP_S = 0.5  # between values that are kept
+STEP_S = 0.5  # interval of kept values
 STEP_NS = round(STEP_S * 1e9)
-THIN_NS = STEP_NS // 5 - 10_000_000  # readings of a sensor that come sooner are left out, which saves time
-WINDOW = 6  # steps of a speed: over 3 s the noise of fixes averages out
-TURN = 2  # steps before and after, between which a turn is taken
-HOLE_S = 2.0  # nothing is known of a longer time without readings
-BREAK_S = 3600.0  # what comes after a longer one, or a clock that was set, is looked at alone
-DRIVES_MPS = 0.7  # slower, fixes show no course but their noise
-PEAKS = (2.5, 97.5)  # percentiles at which a quantity is cut off: jumps of fixes are no motion
-LEAST_S = 30.0  # a shorter common time shows nothing
-SURE = 10.0  # log-likelihood by which a lag must exceed none, and every lag that is not next to it
-SIGMAS = 2.5  # standard deviations by which clocks must differ, beyond what does not matter
-LEAST_STD_S = 0.02  # of an offset: no likelihood is that sharp
-SHOWING = (Gps, GpsVelocity, Imu, Odometry, Encoder)  # kinds that show the motion
-BESIDE_S = 4.0  # lags that are next to the best one: the width of its peak
-SAME_S = 0.3  # clocks that are less apart count as one: a filter inside a receiver lags by as much
+THIN_NS = STEP_NS // 5 - 10_000_000  # a sensor's sooner readings are skipped to save time
+WINDOW = 6  # steps of a speed: 3 s average the noise of fixes
+TURN = 2  # steps on either side of a turn
+HOLE_S = 2.0  # longest gap that is interpolated
+BREAK_S = 3600.0  # a longer gap, or a clock change, starts anew
+DRIVES_MPS = 0.7  # slower fixes show no course
+PEAKS = (2.5, 97.5)  # percentiles that clip a quantity: jumps of fixes are no motion
+LEAST_S = 30.0  # least common time
+SURE = 10.0  # log-likelihood by which a lag must exceed none and all distant lags
+SIGMAS = 2.5  # standard deviations by which clocks must differ, beyond SAME_S
+LEAST_STD_S = 0.02  # least deviation of an offset; likelihoods are not so sharp
+SHOWING = (Gps, GpsVelocity, Imu, Odometry, Encoder)  # kinds that show motion
+BESIDE_S = 4.0  # width of the best lag's peak
+SAME_S = 0.3  # negligible offset: filters inside receivers lag by as much
 
 
 @dataclass(frozen=True)
 class Offset:
-    """How far a sensor's clock is ahead of that of others [s], with its standard deviation.
-
-    delay_s: what its `delay_s` should be.
-    """
+    """Lead of a sensor's clock over the others' [s], with standard deviation; delay_s: the option that corrects it."""
 
     sensor: str
     ahead_s: float
@@ -50,11 +47,11 @@ class Offset:
 
     @property
     def where(self) -> str:
-        """On which side of the others."""
+        """Side of the others."""
         return "ahead of" if self.ahead_s > 0 else "behind"
 
     def sentence(self, *, is_refused: bool = False) -> str:
-        """What to know and do on a live machine. is_refused: for its stamps alone, which may be late and right."""
+        """What to do on a live machine. is_refused: by its stamps alone, which may be late yet right."""
         advice = "set its clock"
         if is_refused:
             advice = f"readings are refused, {advice}" + (", or mend its link" if self.ahead_s < 0 else "")
@@ -64,7 +61,7 @@ class Offset:
 
 
 class ClockOffsets:
-    """Keeps what each sensor of a machine shows of its motion. kept_s: for how long, None for all of it."""
+    """Collects motion by sensor, over kept_s or without limit."""
 
     def __init__(self, machine: MachineConfig, site: SiteConfig, kept_s: float | None = None) -> None:
         projection, kept_ns = Projection(site), math.inf if kept_s is None else kept_s * 1e9
@@ -73,14 +70,14 @@ class ClockOffsets:
         self._motions = {name: motion for name, motion in motions.items() if motion}
 
     def take(self, readings: Iterable[Reading]) -> None:
-        """Take in readings, those of each sensor in the order of their stamps."""
+        """Add readings, in stamp order per sensor."""
         for reading in readings:
             motion = self._motions.get(reading.sensor)
             if motion and not 0 <= reading.stamp_ns - motion.last_ns < THIN_NS and motion.sensor.kind == reading.kind:
                 motion.take(reading)
 
     def find(self) -> list[Offset]:
-        """Sensors whose clock is not that of the others, as far as the motion tells."""
+        """Sensors whose clocks differ, as far as motion shows."""
         shown = {name: signals for name, motion in sorted(self._motions.items()) if (signals := motion.signals())}
         for hub in sorted(shown, key=lambda name: -len(shown[name].values)):
             lags = {name: lag for name in shown if name != hub and (lag := _lag(shown[name], shown[hub]))}
@@ -89,9 +86,9 @@ class ClockOffsets:
         return []
 
     def named(self, clocks: Mapping[str, tuple[float, float]]) -> list[Offset]:
-        """The clocks that are not that of most sensors; where two are as many, receivers are those that are off.
+        """Clocks that differ from the majority's; in a tie, receivers are wrong.
 
-        clocks: how far each is ahead of one of them [s], with the standard deviation.
+        clocks: lead over one of them [s], and standard deviation.
         """
 
         def agrees(one: str, other: str) -> bool:
@@ -116,17 +113,17 @@ class ClockOffsets:
 
 @dataclass(frozen=True)
 class _Signals:
-    """Quantities (n,) by name, STEP_S apart from a multiple of it on; NaN where nothing is known."""
+    """Quantities (n,) by name, STEP_S apart from a multiple of it; NaN if unknown."""
 
     begin_ns: int
     values: dict[str, Floats]
 
 
 class _Motion:
-    """What one sensor shows: places [m] of a receiver, else how far it rolled [m] and turned [rad]."""
+    """A receiver's places [m], or a sensor's roll [m] and turn [rad]."""
 
     def __init__(self, sensor: SensorConfig, projection: Projection, metres: float, kept_ns: float) -> None:
-        """metres: per tick of an encoder."""
+        """Start; `metres` per encoder tick."""
         self.sensor = sensor
         self._projection, self._metres = projection, metres
         self._up = sensor.mount.frame_from_sensor()[2].tolist()
@@ -142,7 +139,7 @@ class _Motion:
             self._kept.clear()
         if isinstance(reading, Gps):
             if isinstance(last, Gps) and (last.lat_deg, last.lon_deg) == (reading.lat_deg, reading.lon_deg):
-                return  # it tells when it was held, not when it was true
+                return  # its stamp is not when it was measured
         elif 0 < dt_s < HOLE_S:
             self._advance(reading, last, dt_s)
         stamp_ns = self.sensor.true_ns(reading.stamp_ns)
@@ -151,7 +148,7 @@ class _Motion:
         if isinstance(reading, Gps):
             self._first, self._second, _ = self._projection.to_map(reading.lat_deg, reading.lon_deg, reading.height_m)
         self._kept.append((stamp_ns, self._first, self._second))
-        while stamp_ns - self._kept[0][0] > self._kept_ns:  # not by number: stamps that leap would span months
+        while stamp_ns - self._kept[0][0] > self._kept_ns:  # not by count: leaping stamps would span months
             self._kept.popleft()
 
     def _advance(self, reading: Reading, last: Reading | None, dt_s: float) -> None:
@@ -169,7 +166,7 @@ class _Motion:
             self._first += self._metres * abs(ticks) / 2
 
     def signals(self) -> _Signals | None:
-        """What it shows by now; None of too short a time."""
+        """What it shows so far; None if too short."""
         if len(self._kept) < LEAST_S or self._kept[-1][0] - self._kept[0][0] < LEAST_S * 1e9:
             return None
         begin_ns = -(-self._kept[0][0] // STEP_NS) * STEP_NS
@@ -186,20 +183,20 @@ class _Motion:
             east, north = _change(first, WINDOW), _change(second, WINDOW)
             speed = np.hypot(east, north) / (WINDOW * STEP_S)
             course = np.where(speed > DRIVES_MPS, np.arctan2(north, east), math.nan)
-            # In a bend an antenna that is ahead of the axle shows the course of a moment later.
+            # In a bend an antenna ahead of the axle shows a later course.
             course -= self.sensor.mount.xyz_m[0] / np.maximum(speed, DRIVES_MPS) * _turned(course) / (2 * TURN * STEP_S)
             return {"speed": _capped(speed), "turn": _capped(_turned(course))}
         shown = {}
         if self.sensor.provides("speed") and self.sensor.kind != Imu.kind:
             shown["speed"] = _capped(_change(first, WINDOW) / (WINDOW * STEP_S))
         if self.sensor.provides("rate") and self.sensor.kind != Encoder.kind:
-            mean = np.convolve(second, np.ones(WINDOW + 1) / (WINDOW + 1), "same")  # as a course over the window is
+            mean = np.convolve(second, np.ones(WINDOW + 1) / (WINDOW + 1), "same")  # like a course over the window
             shown["turn"] = _capped(_change(mean, 2 * TURN))
         return shown
 
 
 def _motion(sensor: SensorConfig, machine: MachineConfig, projection: Projection, kept_ns: float) -> _Motion | None:
-    """Of a sensor that shows motion."""
+    """The motion of a sensor that shows it."""
     shows = sensor.mode == ABSOLUTE if sensor.kind == Gps.kind else sensor.frame == BASE
     if not (sensor.use and shows and KINDS[sensor.kind] in SHOWING):
         return None
@@ -207,7 +204,7 @@ def _motion(sensor: SensorConfig, machine: MachineConfig, projection: Projection
 
 
 def _change(values: Floats, steps: int) -> Floats:
-    """Change over so many steps around each value; NaN at the ends."""
+    """Change over `steps` around each value; NaN at the ends."""
     changes = np.full(len(values), math.nan)
     half = steps // 2
     changes[half : len(values) - half] = values[steps:] - values[:-steps]
@@ -215,7 +212,7 @@ def _change(values: Floats, steps: int) -> Floats:
 
 
 def _turned(course: Floats) -> Floats:
-    """Turns by a course; a machine that reverses does not turn."""
+    """Turns of a course; reversing is no turn."""
     turns = _change(course, 2 * TURN) / math.pi
     return math.pi * (turns - np.round(turns))
 
@@ -225,7 +222,7 @@ def _capped(values: Floats) -> Floats:
 
 
 def _lag(one: _Signals, hub: _Signals) -> tuple[float, float] | None:
-    """How far the clock of one is ahead of the hub's [s], and its standard deviation; None where nothing tells it."""
+    """Lead over the hub's clock [s] and its standard deviation; None if undetermined."""
     shared = one.values.keys() & hub.values.keys()
     if not shared:
         return None
@@ -241,12 +238,11 @@ def _lag(one: _Signals, hub: _Signals) -> tuple[float, float] | None:
 
 
 def _likelihood(one: Floats, hub: Floats) -> Floats:
-    """Log-likelihood (m,) that values and those of the hub are the same, by lag from -(len(hub) - 1) steps on."""
+    """Log-likelihood (m,) of equal values by lag, from -(len(hub) - 1) steps on."""
     size = 1 << (len(one) + len(hub)).bit_length()
     (a, b), (in_a, in_b) = zip(*(_centred(values) for values in (one, hub)), strict=True)
 
     def summed(of_one: Floats, of_hub: Floats) -> Floats:
-        """Sums of products at every lag."""
         by_lag = np.fft.irfft(np.fft.rfft(of_one, size) * np.conj(np.fft.rfft(of_hub, size)), size)
         return np.concatenate([by_lag[size - len(hub) + 1 :], by_lag[: len(one)]])
 
@@ -259,7 +255,7 @@ def _likelihood(one: Floats, hub: Floats) -> Floats:
 
 
 def _centred(values: Floats) -> tuple[Floats, Floats]:
-    """Values without their mean, 0 where not known; and 1 where they are known."""
+    """Values less their mean, 0 if unknown; and a mask of the known."""
     known = np.isfinite(values)
     mean = values[known].mean() if known.any() else 0.0
     return np.where(known, values - mean, 0.0), known.astype(float)

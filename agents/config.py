@@ -1,4 +1,4 @@
-"""Options of an agent (config/agent.toml): its machine, its sensors, and one table per stage."""
+"""Options of an agent (config/agent.toml): machine, sensors, and a table per stage."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,8 +18,7 @@ from protocol.errors import ConfigError
 from protocol.files import load_toml
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig, parse_machine
 
-# Of samples behind their stamps: where a machine's are 300 s behind those of others, the map server takes its clock for
-# wrong, and excludes it.
+# Lag of samples: the map server excludes machines 300 s behind others, as of a wrong clock.
 MOST_LAG_S = 180.0
 
 
@@ -27,8 +26,8 @@ MOST_LAG_S = 180.0
 class AgentConfig:
     """Options of one agent.
 
-    driver: what its sensors are read from; empty: bundles on its key `sensors`. record: where readings are recorded.
-    linger_s: how long to wait at the end for the last samples to be acknowledged.
+    driver: source of its sensors; empty: bundles on its key `sensors`. record: where readings are recorded. linger_s:
+    final wait for acknowledgements.
     """
 
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
@@ -53,14 +52,14 @@ class AgentConfig:
 
 
 def require_place(machine: MachineConfig, config: LocalisationConfig) -> None:
-    """Refuse a machine that can never know where it is; raises ConfigError."""
+    """Refuse a machine without any source of position; ConfigError."""
     if not config.start and not any(s.kind == "gps" and s.use and s.mode == ABSOLUTE for s in machine.sensors):
         problem = "no sensor in use shows its place, so it would never have a pose: give it a `gps`, or its `start`"
         raise ConfigError(machine.name, f"{problem} ([pipeline.localisation])")
 
 
 def load_agent(path: Path) -> tuple[MachineConfig | None, AgentConfig]:
-    """Read an agent's file: its machine with sensors (None where the file has no [machine]), and its options."""
+    """Read an agent's file: machine with sensors (None without [machine]), and options."""
     table, where = load_toml(path), str(path)
     machine = section(table, "machine", where)
     sensors = table.pop("sensor", [])

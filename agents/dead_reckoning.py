@@ -1,9 +1,7 @@
-"""Dead reckoning: distance, turn and speed of a machine from its wheels and gyros.
+"""Dead reckoning: distance, turn and speed by wheels and gyros.
 
-Where wheels are missing or silent, speed over ground by GPS stands in for them (`ground_speed`).
-
-Several sensors of a kind count as their mean, of those that spoke within the last second. So no result depends on the
-order in which they are described, and one that dies leaves the others.
+Without wheels, speed over ground replaces them (`ground_speed`). Sensors of a kind count as the mean of those heard
+within a second: their order does not matter, and one may die.
 """
 
 import math
@@ -27,38 +25,37 @@ from protocol.machine.readings import (
 from protocol.units import GRAVITY_MPS2
 
 WHEELS = ("encoder", "odometry")
-TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # what shows the turn, the best kind first
-STALE_S = 2.0  # an older steering angle, or an older speed to go with it, is not used
-SILENT_NS = 3_000_000_000  # after so long without wheels, speed over ground stands in for them
-MAX_REACH_S = 8.0  # of one speed over ground; differences of fixes come at least so often
-LOADING_S = 3.0  # a machine that stands so long may have loaded or dumped
-PAUSE_S = 1.0  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
+TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # sensors of the turn, best kind first
+STALE_S = 2.0  # age at which steering angle, or its speed, expires
+SILENT_NS = 3_000_000_000  # silence of wheels after which speed over ground replaces them
+MAX_REACH_S = 8.0  # reach of one speed over ground; differences of fixes come more often
+LOADING_S = 3.0  # standstill during which a machine may load or dump
+PAUSE_S = 1.0  # silence after which a sensor restarts
 PAUSE_NS = round(PAUSE_S * 1e9)
-MAX_TRACTION = 1.0  # no tyre on any ground drives with more than its load: a wrong unit must not move the machine
-MAX_WHEEL_MPS = 30.0  # ticks that come faster are a counter that was set back, not a machine that moves
-MIN_NARROWING = 0.2  # of a bend for its inner wheel: one near the middle of the bend rolls too little to scale it up
-NOISE_S = 10.0  # over which the noise of a wheel's speed is measured
-# Variance of the tracked speed over that of one correction of it, by white errors of travel, is 0.23 tau / dt: computed
-# for dt from 0.07 to 0.7 of tau, where it is 0.20 to 0.27.
+MAX_TRACTION = 1.0  # bound of drive force over load, against a wrong unit
+MAX_WHEEL_MPS = 30.0  # bound of wheel speed; beyond it the counter was reset
+MIN_NARROWING = 0.2  # bound of an inner wheel's share of travel: near the centre of a bend it shows no distance
+NOISE_S = 10.0  # time constant of wheel noise
+# Variance of tracked speed over that of one correction, for white travel errors, is 0.23 tau / dt (0.20 to 0.27 for dt
+# of 0.07 to 0.7 tau).
 SPEED_SHARE = 0.23
 
 
 def turn_source(machine: MachineConfig) -> SensorConfig | None:
-    """The sensor that the turn is taken from: an IMU in use that measures rates, else odometry, else steering.
+    """The sensor of the turn: an IMU with rates, else odometry, else steering.
 
-    Of several the one that states the least deviation; one that states none comes last, then the name decides.
+    Of several, the one that states the least deviation, then by name.
     """
     able = [s for s in machine.sensors if s.kind in TURNS and s.use and s.provides(TURNS[s.kind])]
     return min(able, key=lambda s: ([*TURNS].index(s.kind), s.std.get(TURNS[s.kind], math.inf), s.name), default=None)
 
 
 class WheelTracker:
-    """Speed and acceleration from quantised wheel travel: a fading-memory filter of third order.
+    """Speed and acceleration by quantised wheel travel: a third-order fading-memory filter.
 
-    Least squares of a parabola over the past, with weights that fade by exp(-dt / tau_s) (Morrison 1969): stable at
-    any rate, and without lasting error while the acceleration is constant. It starts as plain least squares of all
-    readings so far (the expanding memory, ibid.), until the fading one weighs new readings more: then `is_settled`.
-    std_mps: how unsure the speed is, by the corrections that readings make while the wheels turn.
+    Least-squares parabola with weights exp(-dt / tau_s) (Morrison 1969): stable at any rate, unbiased at constant
+    acceleration. It starts as plain least squares (expanding memory, ibid.), until the fading one weighs new readings
+    more: `is_settled`. std_mps: deviation of the speed, by corrections while the wheels turn.
     """
 
     def __init__(self, tau_s: float = 0.15) -> None:
@@ -66,14 +63,14 @@ class WheelTracker:
         self.accel_mps2 = 0.0
         self.is_settled = False
         self.std_mps = 0.0
-        self._turns, self._shown_m = 0, 0.0  # how many readings the wheels turned by, and the travel of the last
+        self._turns, self._shown_m = 0, 0.0  # readings with motion, and the last one's travel
         self._tau_s = tau_s
         self.travel_m = 0.0
         self._stamp_ns = 0
         self._count = 0
 
     def update(self, stamp_ns: int, travel_m: float, speed_mps: float | None = None) -> None:
-        """Take in the wheel travel so far. speed_mps: where the sensor states it; the tracker starts from there."""
+        """Add total wheel travel; speed_mps, if measured, is the start value."""
         dt = (stamp_ns - self._stamp_ns) * 1e-9
         if not self._stamp_ns or dt > PAUSE_S:
             self.travel_m, self.speed_mps, self.accel_mps2 = travel_m, speed_mps or 0.0, 0.0
@@ -90,17 +87,17 @@ class WheelTracker:
         self.speed_mps += of_speed * error / dt
         self.accel_mps2 += of_accel * error / dt**2
         stood, self._shown_m = travel_m == self._shown_m, travel_m
-        if self.is_settled and not stood:  # wheels that stand still show nothing of their noise
+        if self.is_settled and not stood:  # wheels at rest show no noise
             self._turns += 1
             news = SPEED_SHARE * self._tau_s / dt * (of_speed * error / dt) ** 2
             share = max(1 / self._turns, min(dt / NOISE_S, 1.0))
             self.std_mps = math.sqrt(self.std_mps**2 + share * (news - self.std_mps**2))
 
     def _gains(self, fade: float) -> tuple[float, float, float]:
-        """Gains of travel, speed and acceleration, in units of the time step."""
+        """Gains of travel, speed and acceleration, per time step."""
         if not self.is_settled:
             k = self._count
-            if k == 2:  # two readings are a line
+            if k == 2:  # a line through two readings
                 return 1.0, 1.0, 0.0
             product = k * (k + 1) * (k + 2)
             self.is_settled = (1 - fade) ** 3 * product >= 60
@@ -111,7 +108,7 @@ class WheelTracker:
 
 @dataclass(frozen=True)
 class DeadReckonedPose:
-    """Pose in the frame that dead reckoning started in: travel [m], angle [rad], x, y [m] at a stamp."""
+    """Pose in dead reckoning's start frame: travel [m], angle [rad], x, y [m]."""
 
     stamp_ns: int
     travel_m: float
@@ -122,9 +119,9 @@ class DeadReckonedPose:
 
 @dataclass(frozen=True)
 class WheelSpeed:
-    """Mean speed and acceleration of the wheels. offset_m: how far left of the middle they are, on average.
+    """Mean speed and acceleration of the wheels, on average offset_m left of the middle.
 
-    std_mps: standard deviation of the speed, as measured. is_known: whether readings show a speed yet.
+    std_mps: measured deviation of the speed. is_known: readings show a speed.
     """
 
     speed_mps: float = 0.0
@@ -136,7 +133,7 @@ class WheelSpeed:
 
 @dataclass
 class _Wheel:
-    """One wheel sensor: its last reading, how far it has rolled by then, and the machine's angle then."""
+    """A wheel sensor: last reading, roll so far, and the machine's angle then."""
 
     reading: WheelReading
     offset_m: float
@@ -146,13 +143,11 @@ class _Wheel:
 
 
 class DeadReckoning:
-    """Accumulates wheel travel and turn, without GPS. Readings of one stamp come with those of wheels last.
+    """Accumulates wheel travel and turn. Wheel readings of a stamp come last.
 
-    slip: wheel slip per traction (drive force over weight), taken off where the machine has a torque sensor. weighs:
-    whether payload readings count. mass_kg: with payload; a caller that estimates it may set it. travel_m:
-    of `base_link`, down in reverse; distance_m: up in reverse too. traction: the newest. wheels: as of their newest
-    reading, which came at wheels_ns; a wheel that does not count is as good as silent. ground: the newest speed over
-    ground.
+    slip: per traction (drive force over weight), removed if torque is measured. weighs: payload readings count.
+    mass_kg: with payload; an estimating caller may set it. travel_m, distance_m: of `base_link`, signed and total.
+    wheels: at wheels_ns; an excluded wheel is silent. ground: newest speed over ground.
     """
 
     def __init__(self, machine: MachineConfig, slip: float, *, weighs: bool = True) -> None:
@@ -164,14 +159,12 @@ class DeadReckoning:
         self.traction = 0.0
         self.mass_kg = machine.mass_kg
         self.wheels_ns = 0
-        self._newest_ns = self._resumed_ns = (
-            0  # stamps of the newest reading, and of the first one after a pause of all
-        )
+        self._newest_ns = self._resumed_ns = 0  # stamps of the newest reading, and the first after a common pause
         self.ground: GroundSpeed | None = None
         self._stands_since_ns = 0
         self._machine, self._weighs = machine, weighs
         self._slip = slip
-        self._up: dict[str, list[float]] = {}  # the vertical of `base_link` in each gyro's axes
+        self._up: dict[str, list[float]] = {}  # vertical of `base_link` in gyro axes
         self._gyro_ns: dict[str, int] = {}
         self._wheels: dict[str, _Wheel] = {}
         source = turn_source(machine)
@@ -181,12 +174,12 @@ class DeadReckoning:
         self._ground_tracker, self._ground_rad = GroundTracker(turns=source is not None), 0.0
         self._moved_ns = 0  # over ground
         self._turned_ns = 0  # by odometry or steering
-        self._curvature = 0.0  # [1/m], by steering
+        self._curvature = 0.0  # by steering [1/m]
         self._x_m = 0.0
         self._y_m = 0.0
 
     def update(self, reading: Reading, sensor: SensorConfig) -> None:
-        """Take in a reading of the wheels, of GPS, or of a sensor that shows the turn; others change nothing."""
+        """Add a reading; only wheels, GPS and turn sensors have an effect."""
         if reading.stamp_ns - self._newest_ns > PAUSE_NS:
             self._resumed_ns = reading.stamp_ns
         self._newest_ns = reading.stamp_ns
@@ -209,7 +202,7 @@ class DeadReckoning:
             self.mass_kg = self._machine.mass_kg + reading.payload_kg
 
     def pull(self, traction: float) -> None:
-        """Take this traction, of torque at the wheels or of what a caller makes of an engine's."""
+        """Set traction, by wheel torque or a caller's engine."""
         self.traction = traction if abs(traction) <= MAX_TRACTION else 0.0
 
     @property
@@ -218,17 +211,17 @@ class DeadReckoning:
         return DeadReckonedPose(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m)
 
     def is_silent(self, stamp_ns: int) -> bool:
-        """Whether there are no wheels, or none has been read for so long that they do not count."""
+        """Whether wheels are missing or long silent."""
         return not self._has_wheels or stamp_ns - max(self.wheels_ns, self._resumed_ns) > SILENT_NS
 
     def motion(self, stamp_ns: int) -> WheelSpeed:
-        """Speed by the wheels; where they are silent, over ground."""
+        """Speed by wheels, else over ground."""
         if not self.is_silent(stamp_ns):
             return self.wheels
         return WheelSpeed(self.ground.speed_mps, is_known=True) if self.ground else WheelSpeed()
 
     def still_s(self, stamp_ns: int) -> float:
-        """How long nothing has moved by the wheels; where they are silent, how long speeds over ground showed none."""
+        """Time without motion, by wheels, else over ground."""
         if not self.is_silent(stamp_ns):
             return (stamp_ns - self._stands_since_ns) * 1e-9
         if not self.ground or stamp_ns - self.ground.stamp_ns > FRESH_NS:
@@ -236,20 +229,20 @@ class DeadReckoning:
         return (self.ground.stamp_ns - self._stands_since_ns) * 1e-9
 
     def show_motion(self, stamp_ns: int) -> None:
-        """Let the machine not stand, as something else than its wheels shows."""
+        """Deny standstill, by another sensor's evidence."""
         self._stands_since_ns = stamp_ns
 
     def face(self, heading_rad: float) -> None:
-        """Take this heading for the machine's own, where wheels have led speed over ground astray."""
+        """Set the heading, after wheels misled speed over ground."""
         self._ground_tracker.face(heading_rad - self.angle_rad)
 
     def turn_round(self) -> None:
-        """Take the first motion over ground for one in reverse."""
+        """Reinterpret the first motion over ground as reverse."""
         self._ground_tracker.turn_round()
         self.ground = None
 
     def _turn(self, imu: Imu, sensor: SensorConfig) -> None:
-        """Integrate the vertical rate of a gyro on the rear frame, by its share in the mean."""
+        """Integrate a rear-frame gyro's vertical rate, as its share in the mean."""
         if imu.sensor not in self._up:
             self._up[imu.sensor] = sensor.mount.frame_from_sensor()[2].tolist()
         up = self._up[imu.sensor]
@@ -261,14 +254,13 @@ class DeadReckoning:
         self.stamp_ns = max(self.stamp_ns, imu.stamp_ns)
 
     def _turn_by_odometry(self, odometry: Odometry) -> None:
-        """Turn by the rate of odometry."""
         if self._turned_ns:
             dt_s = (odometry.stamp_ns - self._turned_ns) * 1e-9
             self.angle_rad += odometry.rate_z_radps * min(dt_s, PAUSE_S)
         self._turned_ns = odometry.stamp_ns
 
     def _roll(self, reading: WheelReading, sensor: SensorConfig) -> None:
-        """Advance by what a wheel sensor rolled since its last reading, by its share in the mean."""
+        """Advance by a wheel sensor's roll, as its share in the mean."""
         stamp_ns, offset_m = reading.stamp_ns, sensor.mount.xyz_m[1]
         wheel = self._wheels.setdefault(reading.sensor, _Wheel(reading, offset_m, self.angle_rad))
         others = [w for w in self._wheels.values() if w is not wheel and _speaks(w.reading.stamp_ns, stamp_ns)]
@@ -283,7 +275,7 @@ class DeadReckoning:
         self._advance(wheel, rolled_m, 1 + len(others))
 
     def _advance(self, wheel: _Wheel, rolled_m: float, wheels: int) -> None:
-        """Move `base_link` as one of so many wheels rolled; one on the left rolls less in a bend to the left."""
+        """Move `base_link` by one of several wheels; in a left bend a left one rolls less."""
         stamp_ns = wheel.reading.stamp_ns
         gripped_m = rolled_m * (1 - self._slip * self.traction * math.copysign(1.0, rolled_m))
         curvature = self._curvature if stamp_ns - self._turned_ns < STALE_S * 1e9 else 0.0
@@ -296,7 +288,7 @@ class DeadReckoning:
         wheel.angle_rad = self.angle_rad
 
     def _follow_ground(self, reading: Gps | GpsVelocity, sensor: SensorConfig) -> None:
-        """Keep the speed over ground that a reading shows; move by it while wheels are silent."""
+        """Keep the speed over ground, and move by it while wheels are silent."""
         stamp_ns, before, is_silent = reading.stamp_ns, self.ground, self.is_silent(reading.stamp_ns)
         wheels_mps = None if is_silent else self.wheels.speed_mps
         shown = self._ground_tracker.update(reading, sensor, self.angle_rad, wheels_mps)
@@ -315,7 +307,7 @@ class DeadReckoning:
         self._ground_rad = self.angle_rad
 
     def _move(self, stamp_ns: int, travel_m: float, from_rad: float, *, counts: bool = True) -> None:
-        """Move `base_link` as the angle went from one to the present one. counts: whether it is no mere noise."""
+        """Move `base_link` at the mean angle. counts: more than noise."""
         middle_rad = (from_rad + self.angle_rad) / 2
         self.travel_m += travel_m
         self.distance_m += abs(travel_m) * counts
@@ -325,7 +317,7 @@ class DeadReckoning:
 
 
 def rolled_between(last: WheelReading, now: WheelReading, sensor: SensorConfig, machine: MachineConfig) -> float:
-    """How far a wheel sensor rolled between two readings, down in reverse [m]."""
+    """Signed roll of a wheel sensor between two readings [m]."""
     dt_s = (now.stamp_ns - last.stamp_ns) * 1e-9
     if isinstance(now, Odometry):
         return now.speed_x_mps * min(dt_s, PAUSE_S)
@@ -336,15 +328,11 @@ def rolled_between(last: WheelReading, now: WheelReading, sensor: SensorConfig, 
 
 
 def narrowing(curvature: float, offset_m: float) -> float:
-    """What a wheel rolls over what the middle of its axle travels, in a bend to the left, where the wheel is left.
-
-    It is 1 - curvature offset; the middle of the bend may lie near the wheel, but such a wheel shows no distance.
-    """
+    """Roll of a wheel over travel of its axle's middle: 1 - curvature offset, both positive left, and bounded."""
     return max(1 - curvature * offset_m, MIN_NARROWING)
 
 
 def _speaks(last_ns: int, now_ns: int) -> bool:
-    """Whether a sensor that was last heard then still counts."""
     return now_ns - last_ns <= PAUSE_NS
 
 

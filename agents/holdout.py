@@ -1,8 +1,7 @@
-"""Fixes that are withheld from the filter and compared with its poses: an honest error on real logs.
+"""Fixes withheld from the filter and compared with its poses: an honest error on real logs.
 
-A receiver that is away has no velocity either, so that is withheld with the fixes. A fix is compared twice: with the
-place, and with where it is expected, the place plus the receiver's believed slow error. The first alone would punish a
-filter that does not follow slow errors.
+Velocities are withheld too, as an absent receiver has none. A fix is compared with the position, and with the position
+plus the receiver's estimated slow error: the first alone would punish a filter that does not follow slow errors.
 """
 
 import math
@@ -19,15 +18,15 @@ from protocol.machine.readings import Gps, GpsVelocity, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
 FIGURES = ("rms_m", "median_m", "max_m", "end_m", "expected_rms_m", "expected_median_m")
-NOTHING: dict[str, float | int | None] = {"fixes": 0, **dict.fromkeys(FIGURES)}  # the report if no fix was judged
-SETTLE_S = 40.0  # fixes are judged from so long after the first reading on: by then a machine that drives is aligned
+NOTHING: dict[str, float | int | None] = {"fixes": 0, **dict.fromkeys(FIGURES)}  # report without judged fixes
+SETTLE_S = 40.0  # time before fixes are judged: a driving machine is aligned by then
 
 
 class Schedule(Protocol):
     """When GPS is withheld."""
 
     def withholds(self, seconds: float) -> bool:
-        """Whether it is withheld so long after the first reading."""
+        """Whether it is, `seconds` after the first reading."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +41,12 @@ class HoldoutConfig:
             raise ValueError("off_s must lie between 0 and period_s")
 
     def withholds(self, seconds: float) -> bool:
-        """Whether GPS is withheld so long after the first reading."""
+        """Whether GPS is withheld, `seconds` after the first reading."""
         return seconds % self.period_s < self.off_s
 
 
 class Holdout:
-    """Splits off fixes before the pipeline sees them, and compares them with its poses afterwards."""
+    """Withholds fixes from the pipeline, and compares them with its poses."""
 
     def __init__(
         self, site: SiteConfig, machine: MachineConfig, schedule: Schedule, settle_s: float = SETTLE_S
@@ -56,17 +55,17 @@ class Holdout:
         self._projection = Projection(site)
         self._sensors = {s.name: s for s in machine.sensors}
         self._first_ns = 0
-        self._waiting: deque[tuple[Gps, int]] = deque()  # and of which outage
-        self._errors_m: list[tuple[float, float]] = []  # against the place, and where the fix is expected
-        self._last_m: dict[int, float] = {}  # errors of the last fix of each outage
+        self._waiting: deque[tuple[Gps, int]] = deque()  # with number of the outage
+        self._errors_m: list[tuple[float, float]] = []  # against the position, and the expected fix
+        self._last_m: dict[int, float] = {}  # of each outage's last fix
         self._outage, self._is_dark = 0, False
 
     def split(self, readings: Sequence[Reading]) -> list[Reading]:
-        """Return what the pipeline may see."""
+        """The readings that the pipeline may see."""
         return [r for r in readings if not self._is_withheld(r)]
 
     def compare(self, pipeline: PoseSource) -> None:
-        """Compare withheld fixes with the poses that are known by now."""
+        """Compare withheld fixes with the poses known so far."""
         pose = pipeline.pose
         while pose and self._waiting and self._true_ns(self._waiting[0][0]) <= pose.stamp_ns:
             fix, outage = self._waiting.popleft()
@@ -81,9 +80,9 @@ class Holdout:
                 self._errors_m.append((self._last_m[outage], math.hypot(dx + slow_x, dy + slow_y)))
 
     def report(self) -> dict[str, float | int | None]:
-        """How many fixes were judged, and the error against them [m].
+        """Number of judged fixes and their errors [m].
 
-        end_m: rms of the last ones of the outages. expected_: with the receiver's believed slow error.
+        end_m: rms of each outage's last. expected_: with the estimated slow error.
         """
         if not self._errors_m:
             return dict(NOTHING)

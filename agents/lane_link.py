@@ -1,6 +1,6 @@
-"""Lanes over Zenoh: asks the map server for those around the machine, now and then; without a link the last ones hold.
+"""Lanes over Zenoh: asks the map server for those around the machine; without a link the last ones hold.
 
-Replies come on threads of Zenoh, and wait until the agent looks: one thread owns the filter.
+Replies arrive on Zenoh's threads and wait for the agent's, which owns the filter.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from protocol.queries.parameters import selector_of
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 
-# Of the machine's time: after a question that nobody answered, and while there are no lanes; after each answer SLOWER
-# times as long as before, since an old map changes little. An answer with all has 8 to 15 kB, three come in an hour.
+# Interval in machine time without answer or lanes; each answer multiplies it by SLOWER, as an old map changes little. A
+# full answer has 8 to 15 kB.
 AGAIN_S, MOST_S, SLOWER = 60.0, 1800.0, 5
 ANSWER_S = 20.0
-REACH_M = 1000.0  # of the square that is asked for
-MOVED_M = 500.0  # from its middle: another square is asked for
+REACH_M = 1000.0  # half width of the requested square
+MOVED_M = 500.0  # distance from its middle at which another one is requested
 
 
 @dataclass(frozen=True)
 class KnownLanes:
-    """What an agent has of the lanes around a place. newest_ns: the site's now of the answer."""
+    """Known lanes around a place."""
 
     middle_m: tuple[float, float]
     answer: LanesAnswer
     lanes: LaneMap
 
     def question(self, pose: PoseBelief) -> LanesQuery:
-        """What to ask to have them up to date at a pose."""
+        """The query that updates them for a pose."""
         is_near = math.dist(self.middle_m, (pose.x_m, pose.y_m)) < MOVED_M
         if not is_near or not self.answer.stamp_ns:  # 0: nobody had driven
             return first_question(pose)
@@ -54,7 +54,7 @@ def _around(middle_m: tuple[float, float]) -> Bounds:
 
 
 def known_after(known: KnownLanes | None, query: LanesQuery, answer: LanesAnswer) -> KnownLanes | None:
-    """What is known after an answer; None where it does not go with what was known, so that all is asked anew."""
+    """The lanes after an answer; None if it does not continue the known ones."""
     assert query.bounds is not None
     middle_m = query.bounds.west_m + REACH_M, query.bounds.south_m + REACH_M
     tiles = {(tile.x, tile.y): tile for tile in answer.tiles}
@@ -66,7 +66,7 @@ def known_after(known: KnownLanes | None, query: LanesQuery, answer: LanesAnswer
 
 
 def _map_of(answer: LanesAnswer) -> tuple[str, int]:
-    """Store and decisions, within which squares without new samples stay as they are."""
+    """Store and decisions; while equal, squares without new samples stay."""
     return answer.version.store, answer.version.fact
 
 
@@ -81,7 +81,7 @@ class LaneLink:
         self._next_s, self._rest_s = 0.0, AGAIN_S
 
     def look(self, pose: PoseBelief | None) -> LaneMap | None:
-        """Take in what came, and ask where that is due; returns lanes that are new, None for none. pose: the newest."""
+        """Process answers, ask if due; returns new lanes or None."""
         if pose is None:
             return None
         now_s = pose.stamp_ns * 1e-9
@@ -93,7 +93,7 @@ class LaneLink:
                 fresh = self.known.lanes if self.known else None
                 if fresh and fresh.tiles:
                     self._rest_s = min(SLOWER * self._rest_s, MOST_S)
-                self._next_s = now_s + self._rest_s * bool(fresh)  # at once where all has to be asked for anew
+                self._next_s = now_s + self._rest_s * bool(fresh)  # immediately if all must be requested anew
         if not self._next_s - MOST_S <= now_s < self._next_s:  # a clock may be set back
             self._ask(self.known.question(pose) if self.known else first_question(pose))
             self._next_s = now_s + AGAIN_S

@@ -1,11 +1,8 @@
-"""The pure core of an agent: readings in, samples out. No clock, no files, no network.
+"""The pure core of an agent: readings to samples. No clock, files or network.
 
-`Positioning` is the half of it that locates the machine; `Pipeline` adds the estimate of the ground, and samples of it.
-
-The smoothed track: where the machine was, as known a while later; it corrects what the filter believed at once.
-
-The smoother has a node in every second. Between two of them the correction, smoothed less filtered, is interpolated:
-it changes slowly, while the filter's own poses have all that the machine did meanwhile.
+`Positioning` locates the machine; `Pipeline` adds ground estimates and samples. The smoothed track has a node each
+second. Between nodes the correction, smoothed less filtered, is interpolated: it changes slowly, and the filter's poses
+hold the motion.
 """
 
 from __future__ import annotations
@@ -35,9 +32,9 @@ from protocol.machine.readings import FuelRate, Reading
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import SiteConfig
 
-KEPT_NS = 30_000_000_000  # a pose is corrected as soon as its nodes are there; it comes at most some seconds after them
-CLOCKS_S = 600.0  # of motion in which offsets of clocks are looked for
-LOOK_NS = 60_000_000_000  # between two such looks
+KEPT_NS = 30_000_000_000  # a pose's nodes come some seconds after it at most
+CLOCKS_S = 600.0  # motion in which clock offsets are searched
+LOOK_NS = 60_000_000_000  # interval of these searches
 _stamp = attrgetter("stamp_ns")
 
 
@@ -52,7 +49,7 @@ class Pipeline:
         calibration: Calibration | None = None,
         tuning: EstimationTuning = TUNING,
     ) -> None:
-        """calibration: of the ground estimator, from before."""
+        """Start, with the ground estimator's earlier `calibration`."""
         self._site, self._machine, self._tuning = site, in_name_order(machine), tuning
         self._config, self._smooths = config, config.localisation.smoothing_s > 0
         self._positioning = Positioning(site, machine, config)
@@ -63,51 +60,51 @@ class Pipeline:
 
     @property
     def pose(self) -> PoseBelief | None:
-        """The newest pose, None until the start heading is known."""
+        """The newest pose, None until the heading is known."""
         return self._positioning.pose
 
     def pose_at(self, stamp_ns: int) -> PoseBelief | None:
-        """Pose at a recent stamp, None where it is not known."""
+        """Pose at a recent stamp, or None."""
         return self._positioning.pose_at(stamp_ns)
 
     def slow_error_m(self, receiver: str) -> Floats:
-        """The slow error of a receiver as it is believed now (2,), east and north [m]."""
+        """Estimated slow error of a receiver (2,), east and north [m]."""
         return self._positioning.slow_error_m(receiver)
 
     @property
     def pending(self) -> int:
-        """How many samples are not final yet."""
+        """Number of samples not final."""
         return self._sampler.pending
 
     def step(self, readings: Sequence[Reading]) -> Samples:
-        """Take in readings in the order of their stamps; returns the samples that they made possible."""
+        """Process readings in stamp order; returns the samples they allow."""
         self._clocks.take(readings)
         return joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
 
     def settle(self) -> Samples:
-        """Samples of all that is known now, all of them final: no reading may come for long."""
+        """Final samples of all known so far, as no reading may come for long."""
         rest = self._take(self._positioning.finish())
         proven = self._place(self._positioning.conclude())
         return joined([*rest, *proven, self._settle(self._positioning.remaining())])
 
     def finish(self) -> Samples:
-        """The same, as the stream ends; what has no place then is counted."""
+        """The same at the end of the stream; what has no position is counted."""
         samples = self.settle()
         self._withhold_waiting()
         return samples
 
     @property
     def lanes(self) -> LaneAid | None:
-        """The lanes of all machines, as this one uses them; None where it does not."""
+        """Lanes of the shared map; None if unused."""
         return self._positioning.lanes
 
     def consider(self, offer: Any) -> None:
-        """Judge what the map server offers for the calibration."""
+        """Judge a calibration offer of the map server."""
         self._estimator.consider(offer)
 
     @property
     def calibration(self) -> Calibration:
-        """The calibration that the ground estimator has by now."""
+        """The ground estimator's current calibration."""
         return self._estimator.calibration
 
     def health(self) -> dict[str, Any]:
@@ -132,11 +129,11 @@ class Pipeline:
 
     @property
     def faults(self) -> dict[str, str]:
-        """What is wrong with sensors: a sentence by sensor."""
+        """Sensor faults, a sentence by sensor."""
         return self._positioning.faults
 
     def clocks(self) -> str:
-        """Which sensors' clocks are apart, and what to do; empty where none is known to be."""
+        """Sensors whose clocks differ, and what to do; or empty."""
         if abs(self._newest_ns - self._looked_ns) > LOOK_NS:
             self._looked_ns, self._offsets = self._newest_ns, self._clocks.find()
         refused = self._clocks.named({name: (ahead_s, 0.0) for name, ahead_s in self._positioning.clocks_s.items()})
@@ -180,7 +177,7 @@ class Pipeline:
         return made
 
     def _place(self, poses: Sequence[PoseBelief]) -> list[Samples]:
-        """Samples that proven poses make possible; each pose at once: after a late alignment history holds not all."""
+        """Samples by proven poses, one at a time: after a late alignment the history does not hold all."""
         made: list[Samples] = []
         for pose in poses:
             self._sampler.poses.append(pose)
@@ -194,7 +191,7 @@ class Pipeline:
         return [Samples(rows, NOTHING if self._smooths else self._sampler.final_samples(lambda pose: pose))]
 
     def _settle(self, remaining: Sequence[SmoothedPose], off_m: float = 0.0) -> Samples:
-        """Samples of all that is known. remaining: smoothed poses that are not final. off_m: how far off places are."""
+        """All known samples. remaining: smoothed poses not final. off_m: possible error of places."""
         rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
 
         def corrected(pose: PoseBelief) -> PoseBelief:
@@ -204,7 +201,7 @@ class Pipeline:
         return Samples(rows, self._sampler.final_samples(corrected))
 
     def _corrected(self, pose: PoseBelief) -> PoseBelief | None:
-        """The pose as smoothed, and as sure as it may be after a jump; None while that is not known."""
+        """The smoothed pose, widened after a jump; None while unknown."""
         known = self._track.corrected(pose)
         return less_sure(known, self._watch.off_m(pose.stamp_ns)) if known else None
 
@@ -217,7 +214,7 @@ class Pipeline:
         self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
 
     def _known_c_rr(self) -> float | None:
-        """Resistance of the ground here, where the site states it and the position is sure enough."""
+        """Stated resistance of the ground here, if the position is certain enough."""
         areas = self._site.known_ground
         if not areas or not (pose := self.pose) or not self._watch.is_clear:
             return None
@@ -226,7 +223,7 @@ class Pipeline:
         return next((area.c_rr for area in areas if area.inside_m(pose.x_m, pose.y_m) > margin_m), None)
 
     def _start(self, known: Calibration | None) -> None:
-        """Start with nothing known but the calibration, as after power-up or a jump of the clock."""
+        """Start with nothing but the calibration, as after power-up or a clock jump."""
         config, machine = self._config, self._machine
         self._estimator = GroundEstimator(machine, config.estimation, known, self._tuning)
         self._sampler, self._watch = Sampler(machine.load_centre_m), self._positioning.localiser.watch
@@ -239,13 +236,13 @@ PoseSource = Positioning | Pipeline  # what locates a machine
 
 
 class SmoothedTrack:
-    """Nodes that are final, oldest first."""
+    """Final nodes, oldest first."""
 
     def __init__(self) -> None:
         self._nodes: list[SmoothedPose] = []
 
     def append(self, nodes: Sequence[SmoothedPose], needed_ns: int | None = None) -> None:
-        """Add nodes, which are newer than those before. needed_ns: of the oldest pose that may be asked for."""
+        """Add newer nodes. needed_ns: of the oldest pose still needed."""
         if nodes and self._nodes:
             newest_ns = self._nodes[-1].stamp_ns
             oldest_ns = min(newest_ns, newest_ns if needed_ns is None else needed_ns) - KEPT_NS
@@ -253,24 +250,24 @@ class SmoothedTrack:
         self._nodes += nodes
 
     def corrected(self, pose: PoseBelief) -> PoseBelief | None:
-        """The pose as smoothed; None while the node after it is not final."""
+        """The smoothed pose; None until the node after it is final."""
         known = self._nodes and pose.stamp_ns <= self._nodes[-1].stamp_ns
         return corrected(pose, self._nodes) if known else None
 
     def corrected_by_now(self, pose: PoseBelief, remaining: Sequence[SmoothedPose]) -> PoseBelief:
-        """The pose as smoothed by what is known now. remaining: nodes that are not final, after those that are."""
+        """The pose as smoothed so far. remaining: nodes not final yet."""
         return corrected(pose, [*self._nodes, *remaining])
 
 
 def less_sure(pose: PoseBelief, off_m: float) -> PoseBelief:
-    """The pose, where it may be off by so much beside what it states."""
+    """The pose with a possible further error."""
     return replace(pose, covariance_m2=pose.covariance_m2 + off_m**2 * np.eye(2)) if off_m else pose
 
 
 def corrected(pose: PoseBelief, nodes: Sequence[SmoothedPose]) -> PoseBelief:
-    """The filter's pose, moved and turned by the correction at its stamp, with the smoothed covariance.
+    """The pose moved by the interpolated correction, with the smoothed covariance.
 
-    nodes: oldest first; beyond them the nearest one holds, without any the pose stays as it is.
+    nodes: oldest first; beyond them the nearest holds, without any the pose stays.
     """
     if not nodes:
         return pose

@@ -1,4 +1,4 @@
-"""Positioning: the half of the pure core that locates the machine, by dead reckoning and localisation."""
+"""Positioning: dead reckoning and localisation, the half of the pure core that locates the machine."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,18 +26,18 @@ from protocol.site.site_config import Projection, SiteConfig
 
 @dataclass(frozen=True)
 class PipelineConfig:
-    """Options of the pure core, one table per stage."""
+    """Options of the pure core, a table per stage."""
 
     localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
     estimation: EstimationConfig = field(default_factory=EstimationConfig)
 
 
 class Accepted(NamedTuple):
-    """Readings of one stamp that count, at the stamp of what they measured; a tuple, as there are hundreds a second.
+    """Readings of one stamp that count, at their measured stamp; a tuple, as hundreds come per second.
 
-    poses: what they made possible or changed, oldest first. smoothed: past poses that became final with them, oldest
-    first. restarts: nothing before them counts any more; then smoothed are all that remained, off_m is how far off the
-    places before may be, and concluded are poses that may become samples now as nothing will prove them any further.
+    poses: new or changed, oldest first. smoothed: newly final past poses, oldest first. restarts: nothing earlier
+    counts; then smoothed holds all that remained, off_m the possible error of earlier places, concluded the poses that
+    may become samples now.
     """
 
     readings: list[Sensed]
@@ -49,10 +49,7 @@ class Accepted(NamedTuple):
 
 
 class Positioning:
-    """Dead reckoning and localisation of one machine, and the history of its poses.
-
-    lanes: of all machines, as this one uses them; None where it does not.
-    """
+    """Dead reckoning, localisation and pose history of one machine. lanes: of the shared map, or None."""
 
     def __init__(
         self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig, tuning: LocalisationTuning = TUNING
@@ -71,36 +68,36 @@ class Positioning:
 
     @property
     def pose(self) -> PoseBelief | None:
-        """The newest pose, None until the start heading is known."""
+        """The newest pose, None until the heading is known."""
         return self.poses.newest
 
     def pose_at(self, stamp_ns: int) -> PoseBelief | None:
-        """Pose at a recent stamp, None where it is not known."""
+        """Pose at a recent stamp, or None."""
         return self.poses.at(stamp_ns)
 
     def slow_error_m(self, receiver: str) -> Floats:
-        """The slow error of a receiver as it is believed now (2,), east and north [m]."""
+        """Estimated slow error of a receiver (2,), east and north [m]."""
         return self.localiser.slow_error_m(receiver)
 
     @property
     def counters(self) -> Counter[str]:
-        """What was used and refused, before restarts too."""
+        """Used and refused, including before restarts."""
         of_lanes = self.lanes.counters if self.lanes else Counter[str]()
         return self._counters + self._order.counters + self.localiser.counters + of_lanes
 
     @property
     def faults(self) -> dict[str, str]:
-        """What is wrong with sensors that do not count, or contradict others: a sentence by sensor."""
+        """Faults of excluded or contradicting sensors, a sentence by sensor."""
         of_wheels = self.judge.problems if self.judge else {}
         return of_wheels | self._antennas.problems | self.localiser.watch.problem
 
     @property
     def clocks_s(self) -> dict[str, float]:
-        """By how much sensors are ahead of those that count [s], where some are refused for that; else empty."""
+        """Lead over the accepted sensors [s], if some are refused for it; else empty."""
         return self._order.clocks_s
 
     def step(self, readings: Sequence[Reading]) -> list[SmoothedPose]:
-        """Take in readings in the order of their stamps; returns the smoothed poses that became final."""
+        """Process readings in stamp order; returns newly final smoothed poses."""
         smoothed: list[SmoothedPose] = []
         for reading in readings:
             for accepted in self.accept(reading):
@@ -110,17 +107,17 @@ class Positioning:
         return smoothed
 
     def remaining(self) -> list[SmoothedPose]:
-        """Smoothed poses that are not final, as known by now: the last words on them where the stream ends."""
+        """Smoothed poses not final, the last word at the end of the stream."""
         return self.localiser.remaining()
 
     def conclude(self) -> list[PoseBelief]:
-        """Poses of a heading that what is known by now proves, as the stream ends or pauses."""
+        """Poses of a heading proven by what is known, at an end or pause of the stream."""
         return self.localiser.conclude(self.dead_reckoning.distance_m)
 
     def accept(self, reading: Reading) -> Iterable[Accepted]:
-        """Take in one reading; returns what counts of the stamp that it ends, to be iterated at once.
+        """Add one reading; returns what counts of the stamp it completes, to be iterated at once.
 
-        The caller appends the poses to `poses`, one by one, before it takes the next.
+        The caller appends each one's poses to `poses` before taking the next.
         """
         sensor = self._sensors.get(reading.sensor)
         if sensor is None or sensor.kind != reading.kind:
@@ -130,11 +127,11 @@ class Positioning:
             self._counters["fix_outside_site"] += 1
             return ()
         true_ns = sensor.true_ns(reading.stamp_ns) if sensor.delay_s else reading.stamp_ns
-        ended = self._order.gather(reading, max(reading.stamp_ns, true_ns))  # never before it was true
+        ended = self._order.gather(reading, max(reading.stamp_ns, true_ns))  # never before it was measured
         return self._accept(ended) if ended else ()
 
     def finish(self) -> Iterable[Accepted]:
-        """Take in the readings of the last stamp, as the stream ends; like `accept`."""
+        """Process the last stamp at the end of the stream, like `accept`."""
         return self._accept(self._order.rest())
 
     def _accept(self, readings: Sequence[Reading]) -> Iterator[Accepted]:
@@ -143,7 +140,7 @@ class Positioning:
                 yield accepted
 
     def _is_on_site(self, fix: Gps) -> bool:
-        """Whether a fix may be: receivers without one state places on the equator; and sites are mistaken."""
+        """Whether a fix is plausible: receivers without one state places on the equator; sites are mistaken."""
         x_m, y_m, _ = self._projection.to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
         return max(abs(x_m), abs(y_m)) <= self._extent_m
 
@@ -152,7 +149,7 @@ class Positioning:
         return replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)) if sensor.delay_s else reading
 
     def _take(self, readings: Sequence[Reading]) -> Accepted | None:
-        """Take in the readings of one stamp; None where all are refused."""
+        """Process one stamp's readings; None if all are refused."""
         taken: list[Sensed] = []
         smoothed: list[SmoothedPose] = []
         concluded: list[PoseBelief] = []
@@ -192,13 +189,10 @@ class Positioning:
         return Accepted(heard or taken, poses, smoothed + self.localiser.take_smoothed(), restarts, off_m, concluded)
 
     def _restart(self, *, forgets_times: bool = False) -> list[SmoothedPose]:
-        """Start again, and keep the counts; returns the smoothed poses that remained.
-
-        forgets_times: stamps of before say nothing of those to come.
-        """
+        """Restart, keep counters; returns remaining smoothed poses. forgets_times: earlier stamps mean nothing now."""
         if self.judge and forgets_times:
             self.judge.forget_times()
-        if self.localiser.is_aligned:  # a start that was configured is far behind by now
+        if self.localiser.is_aligned:  # a configured start is long past
             self._config = replace(self._config, start=())
         self._counters.update(self.localiser.counters)
         smoothed = self.localiser.take_smoothed() + self.remaining()
@@ -206,7 +200,7 @@ class Positioning:
         return smoothed
 
     def _start(self) -> None:
-        """Start with nothing known, as after power-up or a jump of the clock."""
+        """Start with nothing known, as after power-up or a clock jump."""
         weighs = self._mass == "message"
         self.dead_reckoning = DeadReckoning(self._machine, self._config.slip, weighs=weighs)
         if self.lanes:
@@ -225,11 +219,11 @@ class Positioning:
             self.judge.restart()
 
     def _is_weighed(self) -> bool:
-        """Whether the load is known; a machine whose data have no place for one carries none."""
+        """Whether the load is known; a machine without payload data carries none."""
         carries = self._machine.payload_x_m or self._machine.payload_z_m
         return not carries or self._mass != "message" or any(s.kind == "payload" for s in self._sensors.values())
 
 
 def in_name_order(machine: MachineConfig) -> MachineConfig:
-    """The machine with its sensors by name: the order of their tables in a file must not change any result."""
+    """The machine with sensors by name: their order in a file must not change results."""
     return replace(machine, sensors=tuple(sorted(machine.sensors, key=attrgetter("name"))))

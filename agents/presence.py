@@ -1,8 +1,7 @@
-"""What other processes see of a machine: live pose, health, a liveliness token, and an answer to who it is.
+"""What others see of a machine: live pose, health, liveliness token, and an answer to who it is.
 
-The token shows that an agent is there, for as long as the router believes so (up to the lease after a broken link). A
-query on the same key is answered by a live agent only: so a machine that restarts never mistakes its own
-killed predecessor for another agent (protocol/wire/owners.py).
+The token lasts as long as the router trusts it (up to the lease after a broken link). Only live agents answer a query
+on the same key, so a restarted machine never takes its killed predecessor for another agent (protocol/wire/owners.py).
 """
 
 from collections.abc import Mapping
@@ -16,21 +15,21 @@ from protocol.wire.codec import encode_health, encode_pose
 from protocol.wire.messages import Health, Pose
 from protocol.wire.owners import ANSWER_S, EVERY_OTHER, Owner, encode_owner, owner_of, this_process
 
-POSE_NS = 200_000_000  # five a second, of the machine's own time
-PATIENCE = 5  # looks without an answer, until another agent counts as gone
+POSE_NS = 200_000_000  # five per second of machine time
+PATIENCE = 5  # looks without answer until another agent counts as gone
 
 
 def find_namesake(session: zenoh.Session, site: str, machine: str, wait_s: float = ANSWER_S) -> Owner | None:
-    """Ask for a live agent of this name elsewhere; None if none answers."""
+    """Ask for a live agent of this name elsewhere; None without answer."""
     asked = session.get(keys.alive(site, machine), timeout=wait_s, **EVERY_OTHER)
     return min((owner for reply in asked if (owner := owner_of(reply))), default=None)
 
 
 class Presence:
-    """Publishes pose and health; a message may be lost, as the next one replaces it.
+    """Publishes pose and health; the next message replaces a lost one.
 
-    While a machine catches up they wait for at most one batch of samples, which the uplink keeps to about a second.
-    Zenoh's priorities do not help there, because a batch lies in the socket's buffer already.
+    During catch-up they wait for at most one batch, about a second; Zenoh's priorities do not help, as the batch is
+    already in the socket's buffer.
     """
 
     def __init__(self, session: zenoh.Session, site: str, machine: str, owner: Owner | None = None) -> None:
@@ -50,14 +49,11 @@ class Presence:
 
     @property
     def owner(self) -> Owner:
-        """Who this agent is."""
+        """This agent."""
         return self._owner
 
     def look_around(self) -> Owner | None:
-        """Return the agent whose name this is, if it is another one; and ask again for the next call.
-
-        Answers arrive between two calls, within ANSWER_S.
-        """
+        """The other agent that holds this name, or None; asks again for the next call."""
         answers, self._answers = self._answers, set()
         self._session.get(self._key, self._on_reply, timeout=ANSWER_S, **EVERY_OTHER)
         if rival := min((owner for owner in answers if owner < self._owner), default=None):
@@ -69,7 +65,7 @@ class Presence:
         return self._rival
 
     def show_pose(self, belief: PoseBelief) -> None:
-        """Publish the pose if the last one is old enough."""
+        """Publish the pose, if due."""
         if abs(belief.stamp_ns - self._pose_ns) < POSE_NS:
             return
         self._pose_ns = belief.stamp_ns

@@ -1,4 +1,4 @@
-"""[record]: an agent writes the readings that it takes into files, the oldest of which make room for new ones."""
+"""[record]: an agent records its readings; the oldest files make room for new ones."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from protocol.machine.readings import Reading
 from protocol.machine.recorded_readings import record_reading
 from protocol.recording import Recording
 
-FILES = 20  # that max_mb is shared by: so much of it is lost when the oldest one goes
-AGAIN_S = 60.0  # after an error of the disk
+FILES = 20  # files that share max_mb: the share lost with the oldest one
+AGAIN_S = 60.0  # pause after a disk error
 
 
 @dataclass(frozen=True)
 class RecordConfig:
-    """Where readings are recorded. folder: empty: nowhere. max_mb: of all files of the machine there [MB]."""
+    """Where readings are recorded. folder: empty for none. max_mb: of all the machine's files [MB]."""
 
     folder: str = ""
     max_mb: float = 2000.0
@@ -31,7 +31,7 @@ class RecordConfig:
 
 
 class ReadingsRecorder:
-    """Records the readings of one machine. While there is no room they are not recorded, and the machine goes on."""
+    """Records one machine's readings; a full disk stops recording, not the machine."""
 
     def __init__(
         self,
@@ -41,8 +41,8 @@ class ReadingsRecorder:
         now_ns: Callable[[], int] = time.time_ns,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """ModuleNotFoundError where the extra `record` is not installed; OSError where there can be no such folder."""
-        import mcap.writer  # noqa: F401 - now, and not with the first reading
+        """ModuleNotFoundError without the extra `record`; OSError for an impossible folder."""
+        import mcap.writer  # now, not at the first reading
 
         self._folder, self._file_bytes = Path(config.folder), config.max_mb * 1e6 / FILES
         self._machine, self._sensors = machine.name, {sensor.name for sensor in machine.sensors}
@@ -54,7 +54,7 @@ class ReadingsRecorder:
         self._folder.mkdir(parents=True, exist_ok=True)
 
     def take(self, readings: Sequence[Reading]) -> None:
-        """Record readings, of the machine's own sensors: no others make samples."""
+        """Record readings of the machine's own sensors."""
         own = [reading for reading in readings if reading.sensor in self._sensors]
         if self._clock() < self._again_s:
             self._counts["missed"] += len(own)
@@ -70,7 +70,7 @@ class ReadingsRecorder:
             self._fail(error)
 
     def tend(self) -> None:
-        """Flush, and begin the next file where this one is full; every second."""
+        """Each second: flush, and close a full file."""
         if not self._recording:
             return
         try:
@@ -81,11 +81,11 @@ class ReadingsRecorder:
             self._fail(error)
 
     def report(self) -> dict[str, Any]:
-        """How it does, in plain values."""
+        """State in plain values."""
         return {**self._counts, "problem": self._problem}
 
     def close(self) -> None:
-        """Complete the file that is being written."""
+        """Complete the current file."""
         if self._recording:
             try:
                 self._recording.finish()
@@ -94,7 +94,7 @@ class ReadingsRecorder:
             self._recording = None
 
     def _open(self, log_ns: int) -> Recording:
-        """The next file, once there is room for it."""
+        """Make room and open the next file."""
         kept_bytes = (FILES - 1) * self._file_bytes
         for path in sorted(self._folder.glob(f"{self._machine}.*.mcap*"), reverse=True):
             kept_bytes -= path.stat().st_size
@@ -104,7 +104,7 @@ class ReadingsRecorder:
         return Recording(self._folder / f"{self._machine}.{begin:%Y%m%dT%H%M%S.%fZ}.mcap", self._about, self._clock)
 
     def _fail(self, error: OSError) -> None:
-        """Leave what is written, which can be read, and try again later."""
+        """Keep the readable part, and retry later."""
         self._problem = f"readings are not recorded: {error.filename}: {error.strerror}"
         self._again_s = self._clock() + AGAIN_S
         if self._recording:

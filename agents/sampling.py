@@ -1,7 +1,7 @@
-"""Samples: one per stretch driven, at the place where the machine was, with the estimate of the ground there.
+"""Samples: one per stretch, at the machine's place, with the ground estimate there.
 
-A sample is made LAG_S later than the machine was there, so that the estimator has seen what came next. It has the
-filter's position then, and is pending; once the smoother has its word on that place, it is made again, final.
+A sample is made LAG_S late, so that the estimator has seen what follows. It has the filter's position and is pending;
+with the smoother's position it becomes final.
 """
 
 import math
@@ -23,19 +23,19 @@ from protocol.rotations import wrap_angle
 from protocol.units import HOUR_NS
 
 NOTHING = np.empty(0, SAMPLE_DTYPE)
-EVERY_M = 0.5  # driven from one sample to the next: a cell of the map at its usual size
-LAG_S = 2.0  # the ground under the wheels shows in the forces for about so long
-MAX_STD_M = 20.0  # samples of a position less sure than this are withheld: they would blur the map
-HISTORY_S = 30.0  # how long poses are kept: a sample looks back by LAG_S, and a withheld fix by less
+EVERY_M = 0.5  # distance between samples: a usual map cell
+LAG_S = 2.0  # time for which ground still shows in the forces
+MAX_STD_M = 20.0  # position deviation beyond which samples would blur the map
+HISTORY_S = 30.0  # memory of poses: samples look back by LAG_S, withheld fixes by less
 LAG_NS, HISTORY_NS = round(LAG_S * 1e9), round(HISTORY_S * 1e9)
-SILENT_NS = 500_000_000  # wheels without a reading for so long are taken to be gone
-MIN_SPEED_MPS = 0.3  # a slower speed of the filter alone is noise, not distance
+SILENT_NS = 500_000_000  # silence after which wheels count as gone
+MIN_SPEED_MPS = 0.3  # a slower filter speed is noise, not distance
 _stamp = attrgetter("stamp_ns")
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A place to sample: where the machine was at stamp_ns, after distance_m and fuel_l since the mark before."""
+    """A place to sample; distance_m, fuel_l: since the mark before."""
 
     stamp_ns: int
     distance_m: float
@@ -43,25 +43,25 @@ class Mark:
 
 
 class FuelMeter:
-    """Litres that an engine burns while its machine moves: rate times time, by the newest reading."""
+    """Litres burnt while the machine moves: rate times time."""
 
     def __init__(self) -> None:
         self._newest: FuelRate | None = None
         self._litres = 0.0
 
     def add(self, reading: FuelRate, speed_mps: float) -> None:
-        """Take in a reading: the rate before it held until now, unless it is too old or the machine stands."""
+        """Add a reading: the previous rate held until now, unless too old or at standstill."""
         before, self._newest = self._newest, reading
         if before is None:
             return
         span_ns = reading.stamp_ns - before.stamp_ns
         if not 0 < span_ns <= SILENT_NS:
-            self._litres = math.nan  # of this stretch; the next one is known again
+            self._litres = math.nan  # for this stretch only
         elif abs(speed_mps) > MIN_SPEED_MPS:
             self._litres += before.litres_ph * span_ns / HOUR_NS
 
     def take(self, stamp_ns: int) -> float:
-        """Litres since it was asked last; NaN where no reading says so."""
+        """Litres since the last call; NaN if unknown."""
         is_fresh = self._newest and abs(stamp_ns - self._newest.stamp_ns) <= SILENT_NS
         litres, self._litres = self._litres if is_fresh else math.nan, 0.0
         return litres
@@ -69,7 +69,7 @@ class FuelMeter:
 
 @dataclass(frozen=True)
 class SamplePlace:
-    """What a sample is made of: its mark, where the filter saw the machine, and the ground there."""
+    """Parts of a sample: mark, filter's pose, ground."""
 
     mark: Mark
     pose: PoseBelief
@@ -77,10 +77,10 @@ class SamplePlace:
 
 
 class Samples(NamedTuple):
-    """Samples that a step made, in the order of their stamps.
+    """Samples of a step, in stamp order.
 
-    pending: (n,), new ones at the filter's position. final: (k,), the last words on those that were made first and had
-    none so far; they may be of the same step.
+    pending: (n,), new, at the filter's position. final: (k,), final values of the oldest pending ones, perhaps of this
+    step.
     """
 
     pending: Table
@@ -88,7 +88,7 @@ class Samples(NamedTuple):
 
 
 class PoseHistory:
-    """Recent poses, to look up where the machine was."""
+    """Recent poses."""
 
     def __init__(self) -> None:
         self._poses: list[PoseBelief] = []
@@ -99,15 +99,15 @@ class PoseHistory:
         return self._poses[-1] if self._poses else None
 
     def append(self, pose: PoseBelief) -> None:
-        """Add a pose; it replaces those that are not older."""
+        """Add a pose; it replaces those not older."""
         while self._poses and pose.stamp_ns <= self._poses[-1].stamp_ns:
             self._poses.pop()
         self._poses.append(pose)
-        if pose.stamp_ns - self._poses[0].stamp_ns > 2 * HISTORY_NS:  # in bulk: removing in front is slow
+        if pose.stamp_ns - self._poses[0].stamp_ns > 2 * HISTORY_NS:  # in bulk: removal in front is slow
             del self._poses[: bisect_left(self._poses, pose.stamp_ns - HISTORY_NS, key=_stamp)]
 
     def at(self, stamp_ns: int) -> PoseBelief | None:
-        """Pose at a stamp, interpolated; None outside of what is remembered."""
+        """Interpolated pose at a stamp; None if not remembered."""
         if not self._poses or not self._poses[0].stamp_ns <= stamp_ns <= self._poses[-1].stamp_ns:
             return None
         i = bisect_left(self._poses, stamp_ns, key=_stamp)
@@ -117,17 +117,17 @@ class PoseHistory:
 
 
 class Odometer:
-    """Counts the distance driven, up in reverse too: by the wheels, or by the filter's speed while they are silent."""
+    """Total distance by wheels, or by the filter's speed while they are silent."""
 
     def __init__(self) -> None:
         self._distance_m = self._wheels_m = 0.0
         self._counted_ns = 0
 
     def update(self, now_ns: int, wheels_ns: int, wheels_m: float, speed_mps: float | None) -> float:
-        """The distance [m] by now.
+        """The distance so far [m].
 
-        wheels_ns, wheels_m: stamp of the newest wheel reading, and the distance of dead reckoning. speed_mps: the
-        filter's; None before it has one, then dead reckoning counts, by GPS.
+        wheels_ns, wheels_m: newest wheel reading, and dead reckoning's distance. speed_mps: the filter's; without one
+        dead reckoning counts, by GPS.
         """
         if speed_mps is None or now_ns - wheels_ns <= SILENT_NS:
             self._distance_m += wheels_m - self._wheels_m
@@ -138,48 +138,47 @@ class Odometer:
 
 
 class Sampler:
-    """Makes samples; counts by reason what is `withheld` and what is sampled `without_resistance`.
+    """Makes samples; counts reasons in `withheld` and `without_resistance`.
 
-    poses: where the machine was, of a heading that is proven. fuel: what it burns. load_centre_m: how far ahead of the
-    pose a sample lies.
+    poses: of a proven heading. load_centre_m: lead of a sample over the pose.
     """
 
     def __init__(self, load_centre_m: float) -> None:
         self.withheld: Counter[str] = Counter()
         self.without_resistance: Counter[str] = Counter()
         self.poses = PoseHistory()
-        self.is_clear: Callable[[int], bool] = lambda _: True  # whether the place of a stamp is
+        self.is_clear: Callable[[int], bool] = lambda _: True  # whether the place at a stamp is
         self.fuel = FuelMeter()
         self._load_centre_m = load_centre_m
         self._marked_m = 0.0
-        self._marks: deque[Mark] = deque()  # wait for the estimator
-        self._estimated: deque[tuple[Mark, GroundEstimate]] = deque()  # wait for a pose
-        self._pending: deque[SamplePlace] = deque()  # sampled, wait for the smoother
+        self._marks: deque[Mark] = deque()  # waiting for the estimator
+        self._estimated: deque[tuple[Mark, GroundEstimate]] = deque()  # waiting for a pose
+        self._pending: deque[SamplePlace] = deque()  # waiting for the smoother
 
     @property
     def waiting(self) -> int:
-        """How many marks are not sampled yet."""
+        """Number of marks not sampled."""
         return len(self._marks) + len(self._estimated)
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp of the oldest sample that is not final yet."""
+        """Stamp of the oldest sample not final."""
         return self._pending[0].pose.stamp_ns if self._pending else None
 
     @property
     def pending(self) -> int:
-        """How many samples are not final yet."""
+        """Number of samples not final."""
         return len(self._pending)
 
     def mark(self, stamp_ns: int, distance_m: float) -> None:
-        """Note the distance driven so far, up in reverse too: every EVERY_M a sample becomes due."""
+        """Note the total distance; every EVERY_M a sample is due."""
         since_m = distance_m - self._marked_m
         if since_m >= EVERY_M:
             self._marked_m = distance_m
             self._marks.append(Mark(stamp_ns, min(since_m, 2 * EVERY_M), self.fuel.take(stamp_ns)))
 
     def due_samples(self, now_ns: int, estimate_at: Callable[[int], GroundEstimate], *, waits: bool = True) -> Table:
-        """Samples (n,) of all marks whose ground and place are known; waits: only of those that are LAG_S old."""
+        """Samples (n,) of marks with known ground and place; waits: only those LAG_S old."""
         while self._marks and self._marks[0].stamp_ns <= now_ns - LAG_NS * waits:
             mark = self._marks.popleft()
             self._estimated.append((mark, estimate_at(mark.stamp_ns)))
@@ -198,14 +197,14 @@ class Sampler:
         return np.array([self._row(place, place.pose) for place in made], SAMPLE_DTYPE)
 
     def final_samples(self, corrected: Callable[[PoseBelief], PoseBelief | None]) -> Table:
-        """Final values (n,) of the oldest pending samples. corrected: a pose as smoothed, None while not known."""
+        """Final values (n,) of the oldest pending samples. corrected: a smoothed pose, or None."""
         rows = []
         while self._pending and (pose := corrected(self._pending[0].pose)):
             rows.append(self._row(self._pending.popleft(), pose))
         return np.array(rows, SAMPLE_DTYPE) if rows else NOTHING
 
     def _is_usable(self, pose: PoseBelief, e: GroundEstimate) -> bool:
-        """Whether a sample can be made of it; counts why not, and what it lacks."""
+        """Whether it makes a sample; reasons are counted."""
         if not self.is_clear(pose.stamp_ns):
             self.withheld["place_unclear"] += 1
             return False
@@ -218,7 +217,7 @@ class Sampler:
         return True
 
     def _row(self, place: SamplePlace, pose: PoseBelief) -> tuple[float, ...]:
-        """The sample of a place, with the machine in this pose: load centre and gradient turn with its heading."""
+        """The sample at a pose; load centre and gradient turn with the heading."""
         mark, e = place.mark, place.estimate
         (xx, xy), (_, yy) = pose.covariance_m2
         c, s = math.cos(pose.heading_rad), math.sin(pose.heading_rad)

@@ -1,6 +1,6 @@
-"""What hinders an agent, the worst first, in sentences: for its terminal, its log, its health, the doctor and the page.
+"""What hinders an agent, worst first, in sentences for terminal, log, health, doctor and page.
 
-A hindrance is a problem where somebody has to mend something. Else it passes, or is how the machine is equipped.
+A problem needs a person; other hindrances pass, or are the machine's equipment.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,16 +14,16 @@ from protocol.machine.machine_config import DRIVES, MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Engine, Gps, GpsVelocity, Imu, Odometry, Reading
 from protocol.machine.samples import ZERO_STD
 
-WAIT_NS = 30 * 10**9  # in the readings' time; a machine that drives off has its heading after 10 to 20 s
-SILENT_S = 10.0  # without a reading: sensors send each second
-CALIBRATED = 0.5  # of the accelerometer's first uncertainty: some metres in both directions, or a closed loop
-REFERENCE_OFF, SURE = 0.05, 3.0  # a scale of the torque beyond it is a wrong data sheet; standard deviations
-UNIT = 1.5  # no tyre is so far off: wheels that turn so much further or less far than the fixes go have another unit
+WAIT_NS = 30 * 10**9  # in reading time; a driving machine has a heading after 10 to 20 s
+SILENT_S = 10.0  # silence of sensors, which send each second
+CALIBRATED = 0.5  # share of the accelerometer's initial deviation: some metres both ways, or a loop
+REFERENCE_OFF, SURE = 0.05, 3.0  # torque scale beyond which the data sheet is wrong; standard deviations
+UNIT = 1.5  # wheel over fix travel (or inverse) beyond any tyre: another unit
 WHEELS = frozenset({Encoder.kind, Odometry.kind})
 SPEEDS = WHEELS | {GpsVelocity.kind}
 NEEDED = {Imu.kind: "force", Odometry.kind: "speed"}
 DRAWS = "rolling resistance and slope go to the map"
-GROUND = {  # faults of sensors, by the ground estimator's reason
+GROUND = {  # sensor faults by the ground estimator's reason
     "no_imu": "no accelerations: track only",
     "no_wheels": "no wheel speeds: slope only",
     "no_torque": "no torque: slope only",
@@ -34,29 +34,29 @@ GROUND = {  # faults of sensors, by the ground estimator's reason
 
 
 class Hindrance(NamedTuple):
-    """Why samples are missing, wait or lack something."""
+    """Why samples are missing, waiting or incomplete."""
 
     sentence: str
     is_problem: bool = True
 
 
 class Status:
-    """Follows a machine's readings, and judges its report. unsampled: why it has no sample, once that is sure."""
+    """Follows readings and judges a report. unsampled: why there is no sample, once certain."""
 
     def __init__(self, machine: MachineConfig) -> None:
         self.unsampled = ""
         self._sensors = {sensor.name: sensor for sensor in machine.sensors if sensor.use}
-        self._kinds: set[str] = set()  # of the readings of the machine's own sensors
-        self._spans_ns: dict[str, tuple[int, int]] = {}  # of each sensor's readings, by its own clock, since a gap
+        self._kinds: set[str] = set()  # of the machine's own sensors
+        self._spans_ns: dict[str, tuple[int, int]] = {}  # time span of each sensor's readings since a gap, by its clock
         self._is_sampled = False
 
     @property
     def heard(self) -> list[str]:
-        """Sensors of the machine that had a reading."""
+        """Sensors that had a reading."""
         return sorted(self._spans_ns.keys() & self._sensors.keys())
 
     def take(self, readings: Sequence[Reading]) -> None:
-        """Take in readings. The time counts from the first one behind a gap, as localisation starts anew there."""
+        """Add readings; time counts from the last gap, where localisation restarts."""
         for reading in readings:
             if (sensor := self._sensors.get(reading.sensor)) and sensor.kind == reading.kind:
                 self._kinds.add(shown(sensor))
@@ -65,16 +65,15 @@ class Status:
             self._spans_ns[reading.sensor] = (first_ns if is_on else reading.stamp_ns), reading.stamp_ns
 
     def sampled(self) -> None:
-        """Note that there is a sample, pending or final."""
+        """Note a sample, pending or final."""
         self._is_sampled, self.unsampled = True, ""
 
     def judge(self, report: Mapping[str, Any]) -> list[Hindrance]:
-        """All that hinders the agent now, the worst first. report: of the agent, in plain values."""
+        """All current hindrances, worst first; report: the agent's, in plain values."""
         hindrances = [*self._of_places(report), *_of_delivery(report), *_of_sensors(report), *self._of_ground(report)]
         return list(dict.fromkeys(hindrances))
 
     def _of_places(self, report: Mapping[str, Any]) -> Iterator[Hindrance]:
-        """Why there is no sample, or none for a while."""
         drivers, silent_s = [Hindrance(problem) for problem in report["driver_problems"]], report["silent_s"]
         if not self._spans_ns or silent_s > SILENT_S:
             yield from drivers
@@ -96,7 +95,6 @@ class Status:
         yield Hindrance(f"no sample yet: {', '.join(causes)}", is_sure)
 
     def _missing(self, state: Mapping[str, Any]) -> list[str]:
-        """Why no sample can be made. state: health of the pipeline."""
         if not self._kinds:
             return ["no reading is of a sensor in the config"]
         if state["heading_proven"]:
@@ -116,14 +114,12 @@ class Status:
         return [f"the heading is not proven until fixes agree with it for {PROVEN_S:g} s and {DISTANCE_M:g} m"]
 
     def _to_align(self) -> str:
-        """What the heading takes."""
         is_blind = not WHEELS & self._kinds and Imu.kind in self._kinds
         distance_m = UNSIGNED_M if is_blind else DISTANCE_M
         lacks = "" if SPEEDS & self._kinds else "no wheel speeds and no Doppler velocity: "
         return f"{lacks}the heading is unknown until the machine has driven {distance_m:g} m with GPS fixes"
 
     def _of_ground(self, report: Mapping[str, Any]) -> Iterator[Hindrance]:
-        """What samples lack."""
         ground = report["pipeline"]["ground"]
         needed = {"accelerations": {Imu.kind}, "wheel speeds": WHEELS, "torque": DRIVES}
         lacks = [what for what, kinds in needed.items() if not kinds & self._kinds]
@@ -146,12 +142,11 @@ class Status:
 
 
 def shown(sensor: SensorConfig) -> str:
-    """The kind of a sensor; empty where it is not used for what that kind is needed for here."""
+    """A sensor's kind; empty if not used for that kind's purpose here."""
     return sensor.kind if sensor.kind not in NEEDED or sensor.provides(NEEDED[sensor.kind]) else ""
 
 
 def _of_delivery(report: Mapping[str, Any]) -> Iterator[Hindrance]:
-    """Why samples are lost, or wait for the map server."""
     for problem in filter(None, (report["spool_problem"], report["spool_damage"])):
         yield Hindrance(problem)
     spool, problem = report["spool"], report["uplink"]["problem"]
@@ -163,7 +158,6 @@ def _of_delivery(report: Mapping[str, Any]) -> Iterator[Hindrance]:
 
 
 def _of_sensors(report: Mapping[str, Any]) -> Iterator[Hindrance]:
-    """What is wrong with receivers, wheels, clocks, corrections and the calibration file."""
     for problem in report["driver_problems"]:
         yield Hindrance(problem)
     for name, fault in report["pipeline"]["faults"].items():
@@ -176,6 +170,6 @@ def _of_sensors(report: Mapping[str, Any]) -> Iterator[Hindrance]:
 
 
 def described(hindrances: Sequence[Hindrance]) -> dict[str, Any]:
-    """As health has it. status: one sentence, of the worst. problems: all that has to be mended, the worst first."""
+    """Health entries. status: the worst in one sentence. problems: all for a person, worst first."""
     problems = [hindrance.sentence for hindrance in hindrances if hindrance.is_problem]
     return {"status": hindrances[0].sentence if hindrances else DRAWS, "problems": problems}

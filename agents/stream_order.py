@@ -1,4 +1,4 @@
-"""Order of readings by their stamps: those of one stamp belong together, late and astray ones are refused."""
+"""Order of readings by stamp; late and stray ones are refused."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -9,8 +9,8 @@ from operator import attrgetter
 from protocol.machine.clock_watch import ClockWatch
 from protocol.machine.readings import Reading
 
-LATE_NS = 500_000_000  # how far behind the newest reading one of another sensor may come
-APART = 10  # refused readings in a row of one sensor: its clock is not that of the others
+LATE_NS = 500_000_000  # largest lateness behind another sensor's newest reading
+APART = 10  # refusals in a row that show a different clock
 WHEELS = ("encoder", "odometry")
 _stamp = attrgetter("stamp_ns")
 
@@ -20,20 +20,20 @@ class Decision(Enum):
 
     ACCEPT = "accept"
     REFUSE = "refuse"
-    RESTART = "restart"  # accept it, and forget all before it
+    RESTART = "restart"  # accept, and forget everything before
 
 
 def by_stamp(readings: Iterable[Reading]) -> Iterator[list[Reading]]:
-    """Readings in the order of their stamps, those of each stamp together and in an order of their own.
+    """Readings grouped by stamp, in order.
 
-    Wheels come last, as what they roll is turned and freed of slip by the others; then the sensors' names decide.
+    Wheels come last, as others turn their roll and remove its slip; then by sensor name.
     """
     ordered = sorted(readings, key=lambda r: (r.stamp_ns, r.kind in WHEELS, r.sensor))
     return (list(group) for _, group in groupby(ordered, key=_stamp))
 
 
 class StreamOrder:
-    """Gathers and decides on the readings of one machine; `counters` holds refusals and restarts by reason."""
+    """Gathers and judges one machine's readings; `counters`: refusals and restarts by reason."""
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
@@ -41,13 +41,13 @@ class StreamOrder:
         self._held_ns = 0
         self._clock = ClockWatch[None](LATE_NS)
         self._by_sensor: dict[str, int] = {}
-        self._refused: dict[str, tuple[int, int]] = {}  # of sensors whose last reading was: how many, and its lead
+        self._refused: dict[str, tuple[int, int]] = {}  # sensors whose last reading was refused: count and lead
 
     def gather(self, reading: Reading, known_ns: int) -> list[Reading]:
-        """Hold a reading until one of another time comes: only then all of its time are there. Returns those.
+        """Hold a reading until one of another time arrives; returns the completed group.
 
-        known_ns: when the machine had it. So a step of the filter waits for the next reading of any sensor, and results
-        depend neither on the order of sensors nor on how a stream is cut into bundles.
+        known_ns: time of arrival. So a filter step waits for the next reading, and results depend neither on the order
+        of sensors nor on bundling.
         """
         ended = self.rest() if known_ns != self._held_ns else []
         self._held_ns = known_ns
@@ -58,20 +58,20 @@ class StreamOrder:
         return ended
 
     def rest(self) -> list[Reading]:
-        """The readings that are held, as the stream ends."""
+        """The held readings, at the end of the stream."""
         held, self._held, self._held_ns = list(self._held.values()), {}, 0
         return held
 
     @property
     def clocks_s(self) -> dict[str, float]:
-        """By how much sensors are ahead of those that count [s], where some are refused for that; else empty."""
+        """Lead over the accepted sensors [s], if some are refused for it; else empty."""
         apart = {name: ahead_ns * 1e-9 for name, (n, ahead_ns) in self._refused.items() if n > APART}
         return {**dict.fromkeys(self._by_sensor, 0.0), **apart} if apart else {}
 
     def decide(self, reading: Reading) -> Decision:
-        """Decide on one reading, and count it if it is not simply accepted.
+        """Judge one reading; count it unless simply accepted.
 
-        A pause of all sensors ends dead reckoning, as a clock that was set does: the machine may be anywhere after it.
+        A pause of all sensors, or a clock change, ends dead reckoning: the machine may be anywhere.
         """
         stamp, last = reading.stamp_ns, self._by_sensor.get(reading.sensor, 0)
         ahead_ns = stamp - self._clock.newest_ns

@@ -1,4 +1,4 @@
-"""Alignment: how the frame of dead reckoning lies in `map`, and the belief that the filter starts from."""
+"""Alignment: the dead-reckoned frame in `map`, and the filter's first belief."""
 
 import math
 from collections.abc import Sequence
@@ -17,22 +17,21 @@ from protocol.arrays import Floats
 from protocol.rotations import wrap_angle
 from protocol.units import GRAVITY_MPS2
 
-DISTANCE_M = 12.0  # driven before the heading is taken from GPS,
-SPREAD_M = 3.0  # and the least spread of the positions around their mean, against slow errors of GPS
-MIN_FIXES = 4.0  # of equal weight
-MAX_STD_RAD = 0.3  # of a heading that a filter can start from: it linearises
-MAX_MISFIT = 2.5  # mean square of residuals over their variance; more, and a first stretch may be off
-MIN_SCALE, MAX_SCALE = 0.8, 1.25  # of dead reckoning: wheels of another radius, and slow errors of GPS on a short way
-GIVEN_STD_M, GIVEN_STD_RAD = 0.5, 0.02  # of a start that is configured
+DISTANCE_M = 12.0  # distance before GPS gives the heading
+SPREAD_M = 3.0  # least spread of positions, against slow GPS errors
+MIN_FIXES = 4.0  # in equal weights
+MAX_STD_RAD = 0.3  # bound of heading deviation for a linearising filter
+MAX_MISFIT = 2.5  # mean squared residual beyond which a first stretch may be off
+MIN_SCALE, MAX_SCALE = 0.8, 1.25  # bounds of dead reckoning's scale: wheel radius, slow GPS errors
+GIVEN_STD_M, GIVEN_STD_RAD = 0.5, 0.02  # of a configured start
 TO_COMPLEX = np.array([1.0, 1.0j])
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """The dead-reckoned frame in `map`: rotation [rad] with its standard deviation, and the place of its origin [m].
+    """The dead-reckoned frame in `map`: rotation and its deviation [rad], origin and its deviation fix_std_m.
 
-    fix_std_m: standard deviation of the origin. wheel_scale: how much further the wheels turn than the fixes go [-], as
-    far as these show it. since_ns: stamp of the first fix that counts; 0 where all do.
+    wheel_scale: wheel travel over fix travel, less 1. since_ns: stamp of the first fix that counts; 0 for all.
     """
 
     rotation_rad: float
@@ -44,19 +43,19 @@ class Alignment:
 
 
 def align(reckoned_m: Floats, fixes_m: Floats, variance_m2: Floats) -> tuple[Alignment, int] | None:
-    """Fit dead-reckoned antenna positions (n, 2) onto fixes (n, 2) by rotation and shift (Umeyama 1991, in 2-D).
+    """Fit dead-reckoned antennas (n, 2) to fixes (n, 2) by rotation and shift (Umeyama 1991, in 2-D).
 
-    variance_m2: of each fix (n,), slow errors included; they weigh it. Returns the alignment and the index of the first
-    fix that counts: 0, unless the residuals say that a first stretch is off; then the rest that shows the heading best
-    counts. None where nothing shows it. Points are complex numbers here: with centred d and f and weights w,
+    variance_m2: of each fix (n,), with slow errors. Returns the alignment and the index of the first fix that counts:
+    0, unless residuals show a bad first stretch; then the remainder that shows the heading best. None if nothing does.
+    Complex points, centred d and f, weights w:
 
         rotation = arg sum w conj(d) f        residuals = sum w |f|^2 + s^2 sum w |d|^2 - 2 s |sum w conj(d) f|
 
-    where s is the scale of dead reckoning, within bounds. The standard deviation takes half the spread for granted, as
-    slow errors do not average out, and grows with residuals that are far larger than the variances say (Birge 1932).
+    s: bounded scale of dead reckoning. The standard deviation uses half the spread, as slow errors do not average out,
+    and grows with excessive residuals (Birge 1932).
     """
     n, weight = len(fixes_m), 1 / variance_m2
-    about_d, about_f = reckoned_m[-1], fixes_m[-1]  # sums stay small
+    about_d, about_f = reckoned_m[-1], fixes_m[-1]
     d, f = (reckoned_m - about_d) @ TO_COMPLEX, (fixes_m - about_f) @ TO_COMPLEX
     columns = (
         weight,
@@ -92,7 +91,7 @@ def align(reckoned_m: Floats, fixes_m: Floats, variance_m2: Floats) -> tuple[Ali
 
 
 def align_fixes(fixes: Sequence[Fix]) -> Alignment | None:
-    """The alignment by absolute fixes, in the order of their stamps; None where they do not show the heading."""
+    """Alignment by absolute fixes in stamp order; None if they do not show the heading."""
     absolute = [fix for fix in fixes if fix.is_absolute]
     if len(absolute) < MIN_FIXES:
         return None
@@ -103,7 +102,7 @@ def align_fixes(fixes: Sequence[Fix]) -> Alignment | None:
 
 
 def align_start(start: Sequence[float], reckoned: DeadReckonedPose) -> Alignment:
-    """The alignment where a machine stands at a known x, y [m] and heading [rad]."""
+    """Alignment of a machine at a known x, y [m] and heading [rad]."""
     x, y, heading = start
     rotation = heading - reckoned.angle_rad
     east_m, north_m = _turned(rotation, reckoned.x_m, reckoned.y_m)
@@ -111,7 +110,6 @@ def align_start(start: Sequence[float], reckoned: DeadReckonedPose) -> Alignment
 
 
 def _turned(angle_rad: float, x: float, y: float) -> tuple[float, float]:
-    """A vector, turned to the left."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return c * x - s * y, s * x + c * y
 
@@ -124,10 +122,10 @@ def start_belief(
     turn_error_radps: float,
     tuning: LocalisationTuning = TUNING,
 ) -> Belief:
-    """The belief at the first step. The filter uses the fixes again, so the position is left wide.
+    """The belief at the first step; its position is wide, as the fixes count again.
 
-    forces_mps2: specific forces (3,) of the accelerometers, which show roll and pitch. turn_error_radps: standard
-    deviation of the lasting error of a turn that no IMU measures, 0 where there is none.
+    forces_mps2: specific forces (3,), which show roll and pitch. turn_error_radps: of the lasting turn error without
+    IMU.
     """
     reckoned = step.reckoned
     x, variance = np.zeros(layout.n), np.full(layout.n, 1e-6)

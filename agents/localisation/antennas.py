@@ -1,12 +1,12 @@
-"""Antennas on trial: whether they sit as their mounts say, by the direction that the machine drives in. Pure.
+"""Checks antenna mounts against the direction of driving. Pure.
 
-Over a straight stretch the machine points along its way, so with c its course, all complex,
+On a straight stretch of course c,
 
     z = mean of exp(-i c) v conj(d) / |d|^2
 
-is 1, where v is the vector from one antenna to another in `map` by their fixes, and d the same by their mounts. It is
--1 where the two are exchanged. A heading is on trial as the vector exp(i yaw), with d = 1. The error of z is that of
-fixes: their white part fades with their number, their slow part with the time driven over its correlation time.
+is 1, and -1 for exchanged antennas; v: vector between two antennas in `map` by fixes, d: by mounts, all complex. A
+heading is tested as exp(i yaw) with d = 1. The fixes' white error falls with their number, the slow part with driving
+time over its correlation time.
 """
 
 import cmath
@@ -20,19 +20,19 @@ from protocol.machine.machine_config import ABSOLUTE, BASE, MachineConfig, Senso
 from protocol.machine.readings import Attitude, Gps, Reading
 from protocol.site.site_config import Projection
 
-STRETCH_M = 10.0  # long enough for a course within some degrees
-STRAIGHT = 0.85  # of the way that a stretch must be long, from end to end
-APART_M = 0.5  # of two antennas: if less, reflections alone may turn the vector between them
-GAP_NS = 1_500_000_000  # between two fixes, beyond which no place beside them is known
-DUE_NS = 200_000_000  # between two headings that are used
-WRONG = 0.75  # of |z - 1|: 45 degrees, which no bend and no iron in the machine makes
+STRETCH_M = 10.0  # gives a course within some degrees
+STRAIGHT = 0.85  # least ratio of chord to distance
+APART_M = 0.5  # least antenna distance, against reflections
+GAP_NS = 1_500_000_000  # longest gap of fixes to interpolate
+DUE_NS = 200_000_000  # interval of used headings
+WRONG = 0.75  # bound of |z - 1|: 45 degrees, beyond bends or iron
 SIGMA = 3.0
 LEAST = 3  # stretches
 
 
 @dataclass
 class Trial:
-    """Evidence on one vector. expected: by the mounts. white, slow: variances of one value, and the slow one's time."""
+    """Evidence on one vector. expected: by mounts. white, slow: variances of one value."""
 
     expected: complex = 1 + 0j
     white: float = 0.0
@@ -40,13 +40,13 @@ class Trial:
     slow_s: float = 1.0
     shown: complex = 0j  # sum over this stretch
     n: int = 0
-    total: complex = 0j  # sum of z over the stretches
+    total: complex = 0j  # sum of z over stretches
     stretches: int = 0
     values: int = 0
     driven_s: float = 0.0
 
     def finish(self, course: complex, seconds: float) -> None:
-        """End a stretch of this course, a unit vector; 0: it shows nothing."""
+        """End a stretch of this course, a unit vector, or 0 for none."""
         if course and self.n:
             z = self.shown / self.n * course.conjugate() * self.expected.conjugate() / abs(self.expected) ** 2
             self.total += z
@@ -57,7 +57,7 @@ class Trial:
 
     @property
     def wrong(self) -> complex | None:
-        """z, where it is certainly none of a right mount."""
+        """The mean z, if it certainly contradicts the mounts."""
         if self.stretches < LEAST:
             return None
         z = self.total / self.stretches
@@ -67,10 +67,7 @@ class Trial:
 
 
 class Antennas:
-    """Compares all antennas of a machine with the way that it drives; problems: a sentence by sensor.
-
-    Which way is ahead, wheels show or an accelerometer: a machine without either is not judged.
-    """
+    """Compares a machine's antennas with its driving; not without wheels or accelerometer, which show ahead."""
 
     def __init__(self, machine: MachineConfig, projection: Projection) -> None:
         used = [s for s in machine.sensors if s.use and s.frame == BASE and s.mode == ABSOLUTE]
@@ -86,18 +83,18 @@ class Antennas:
         self._base_from_sensor = {s.name: s.mount.frame_from_sensor() for s in compasses}
         self._trials |= {name: Trial() for name in self._base_from_sensor}
         self._track: deque[tuple[int, complex]] = deque(maxlen=2)  # newest fixes of the reference
-        self._begin: tuple[int, complex, float, float] | None = None  # of the stretch: stamp, place, travel, distance
+        self._begin: tuple[int, complex, float, float] | None = None  # begin of the stretch: stamp, place, travel, way
         self._variance = (0.0, 0.0)  # of the reference: white and slow
         self._due_ns = dict.fromkeys(self._base_from_sensor, 0)
 
     @property
     def problems(self) -> dict[str, str]:
-        """What is certainly wrong."""
+        """What is certainly wrong, a sentence by sensor."""
         wrong = {name: z for name, trial in self._trials.items() if (z := trial.wrong) is not None}
         return {name: self._sentence(name, z) for name, z in wrong.items()}
 
     def take(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> None:
-        """Take in a reading, after dead reckoning; of other sensors it changes nothing."""
+        """Add a reading, after dead reckoning; other sensors are ignored."""
         if not self._trials or self._reference is None:
             return
         if isinstance(reading, Gps) and sensor.name in (self._reference.name, *self._trials):
@@ -108,7 +105,7 @@ class Antennas:
             self._show(sensor.name, cmath.exp(1j * yaw))
 
     def restart(self) -> None:
-        """Forget the stretch: dead reckoning starts anew."""
+        """Drop the stretch, as dead reckoning restarts."""
         self._finish(0j, 0)
         self._begin = None
         self._due_ns = dict.fromkeys(self._due_ns, 0)
@@ -130,7 +127,7 @@ class Antennas:
         self._follow(fix.stamp_ns, complex(x, y), dead_reckoning)
 
     def _reference_at(self, stamp_ns: int) -> complex | None:
-        """The reference's place by its newest two fixes; a bend of a second shifts it by centimetres."""
+        """The reference's place by its two newest fixes; a bend shifts it by centimetres."""
         if len(self._track) < 2:
             return None
         (from_ns, from_m), (to_ns, to_m) = self._track
@@ -144,7 +141,7 @@ class Antennas:
         trial.n += 1
 
     def _follow(self, stamp_ns: int, place_m: complex, dead_reckoning: DeadReckoning) -> None:
-        """End the stretch where it is long enough, or no straight one any more."""
+        """End the stretch if it is long enough or not straight."""
         now = stamp_ns, place_m, dead_reckoning.travel_m, dead_reckoning.distance_m
         if self._begin is None or stamp_ns <= self._begin[0]:
             self._begin = now
@@ -183,5 +180,4 @@ class Antennas:
 
 
 def _place(sensor: SensorConfig) -> complex:
-    """Ahead and left [m]."""
     return complex(*sensor.mount.xyz_m[:2])

@@ -1,16 +1,14 @@
-"""Filter consistency: size and whiteness of the last innovations of a receiver, and the size of its slow error.
+"""Filter consistency: size and whiteness of a receiver's innovations, and size of its slow error.
 
-Of a consistent filter the normalised innovation squared (NIS), per component, is 1 on average, and successive
-innovations are not correlated (white): Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
-Navigation, section 5.4.
+In a consistent filter the normalised innovation squared (NIS) averages 1 per component, and innovations are white:
+Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4.
 
-Innovations show errors that change faster than the filter takes for possible. An error that is larger and as much
-slower leaves no trace in them: the filter moves with it, and the ellipse misses the truth for as long as it lasts. It
-shows where another receiver, which errs on its own, disagrees: then the slow errors that the filter believes in are
-larger than stated. With one receiver, or with several that err alike, nobody can tell.
+Innovations show errors faster than modelled. The filter follows a larger, slower error without a trace, and the ellipse
+misses the truth. It shows if another receiver with independent errors disagrees: then estimated slow errors exceed
+their stated size. One receiver, or several with common errors, cannot tell.
 
-A receiver that misstates its error shows it in the size of its innovations. So its variance is taken times a factor
-that brings their NIS to 1 (stochastic approximation: Robbins and Monro 1951; adaptive filters: Mehra 1972).
+Misstated errors change the size of innovations, so a factor on the variance brings NIS to 1 (stochastic approximation:
+Robbins and Monro 1951; adaptive filters: Mehra 1972).
 """
 
 import math
@@ -22,23 +20,22 @@ import numpy as np
 from agents.localisation.filters.belief import Conditioned
 from agents.localisation.tuning import TUNING, LocalisationTuning
 
-REMEMBERED = 150  # innovations: half a minute of a 5 Hz receiver
-ENOUGH = 50  # fewer innovations show nothing
+REMEMBERED = 150  # innovations: half a minute at 5 Hz
+ENOUGH = 50  # minimum number of innovations
 MAX_GATED, MIN_NIS, MAX_NIS, MAX_CORRELATION = 0.2, 0.2, 2.5, 0.6
-LEVEL_S = 300.0  # how long slow errors are remembered: some independent ones of less than a minute
-MAX_LEVEL = 1.6  # twice what they are on average where their stated variance is right
-MAX_SHARE = 0.5  # receivers with more of their slow variance in common do not check each other
-PAUSE_S = 2.0  # innovations further apart teach no more than that
+LEVEL_S = 300.0  # memory of slow errors: several independent ones of less than a minute
+MAX_LEVEL = 1.6  # twice the average with correctly stated variance
+MAX_SHARE = 0.5  # common share beyond which receivers do not check each other
+PAUSE_S = 2.0  # longest interval credited to one innovation
 INCONSISTENT, CONSISTENT, CANNOT_TELL = "inconsistent", "consistent", "cannot_tell"
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """Of the last innovations of a receiver: share that was gated, NIS per component, correlation of successive ones.
+    """Recent innovations of a receiver: gated share, NIS per component, lag-one correlation.
 
-    slow_error: mean square of its believed slow error over the stated variance, at most about 1 if that is right.
-    is_checked: whether another receiver, which errs on its own, would show a slow error that is larger.
-    variance_factor: what the stated variance is taken times [-].
+    slow_error: mean squared estimated slow error over its stated variance, at most about 1 if right. is_checked:
+    whether an independent receiver would show a larger slow error. variance_factor: applied to the stated variance [-].
     """
 
     gated: float
@@ -50,7 +47,7 @@ class Consistency:
 
     @property
     def verdict(self) -> str:
-        """Whether the filter's covariance is refuted, holds, or holds as far as anybody can tell with one receiver."""
+        """Whether the filter's covariance is refuted, holds, or cannot be checked."""
         if not (
             self.gated <= MAX_GATED
             and MIN_NIS <= self.nis <= MAX_NIS
@@ -62,12 +59,12 @@ class Consistency:
 
     @property
     def report(self) -> dict[str, float | bool | str]:
-        """All of it in plain values."""
+        """All in plain values."""
         return {**asdict(self), "verdict": self.verdict}
 
 
 class InnovationMonitor:
-    """Remembers the last innovations of one receiver. tuning: by which its variance follows them; None: it does not."""
+    """Recent innovations of one receiver. tuning: of its variance factor; None for no factor."""
 
     def __init__(self, tuning: LocalisationTuning | None = None) -> None:
         self._factor = VarianceFactor(tuning=tuning) if tuning else None
@@ -77,14 +74,11 @@ class InnovationMonitor:
 
     @property
     def variance_factor(self) -> float:
-        """What the variance that the receiver states is taken times [-]."""
+        """Factor on the receiver's stated variance [-]."""
         return self._factor.factor if self._factor else 1.0
 
     def note(self, result: Conditioned, slow_error: float | None = None) -> None:
-        """Remember a result of the filter; one without a finite innovation shows nothing.
-
-        slow_error: square of the slow error believed now over its stated variance, per component.
-        """
+        """Add a result. slow_error: current squared slow error over stated variance, per component."""
         if not math.isfinite(result.nis):
             return
         if self._factor:
@@ -99,7 +93,7 @@ class InnovationMonitor:
             self._slow_error -= math.expm1(-passed_s / LEVEL_S) * (slow_error - self._slow_error)
 
     def consistency(self, *, is_checked: bool = False) -> Consistency | None:
-        """Consistency of the last innovations; None as long as there are too few."""
+        """Recent consistency; None with too few innovations."""
         if len(self._last) < ENOUGH:
             return None
         normalised = np.array(self._last)
@@ -111,14 +105,14 @@ class InnovationMonitor:
 
 @dataclass
 class VarianceFactor:
-    """What the variance that a receiver states is multiplied by [-], the slow part too, as its innovations show it."""
+    """Factor on a receiver's stated variance, slow part included [-], by its innovations."""
 
     factor: float = 1.0
     tuning: LocalisationTuning = field(default=TUNING, repr=False)
     _stamp_ns: int = field(default=0, repr=False)
 
     def note(self, result: Conditioned) -> None:
-        """Follow a finite innovation (k,) that was accepted: others may be the filter's fault, or outliers."""
+        """Follow an accepted finite innovation (k,); others may be outliers or the filter's fault."""
         if not result.accepted:
             return
         stamp_ns, tuning = result.belief.stamp_ns, self.tuning

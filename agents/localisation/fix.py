@@ -1,4 +1,4 @@
-"""A fix of a GPS receiver, in `map` and in the frame of dead reckoning."""
+"""A GPS fix, in `map` and in the dead-reckoned frame."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from protocol.machine.machine_config import ABSOLUTE, SensorConfig
 
 @dataclass(frozen=True)
 class Fix:
-    """A fix in `map`, (2,) each [m, m2], and the dead-reckoned pose at that time."""
+    """A fix in `map`, (2,) each [m, m2], with the dead-reckoned pose."""
 
     stamp_ns: int
     sensor: SensorConfig
@@ -22,17 +22,17 @@ class Fix:
 
     @property
     def is_absolute(self) -> bool:
-        """Whether it is a place in `map` without an anchor."""
+        """Whether it needs no anchor."""
         return self.sensor.mode == ABSOLUTE
 
     @property
     def lever_m(self) -> Floats:
-        """Where the antenna sits (3,)."""
+        """Antenna mount (3,)."""
         return np.array(self.sensor.mount.xyz_m)
 
     @property
     def reckoned_antenna_m(self) -> tuple[float, float]:
-        """Where the antenna is by dead reckoning, in its frame."""
+        """The antenna in the dead-reckoned frame."""
         (ahead, left, _), reckoned = self.sensor.mount.xyz_m, self.reckoned
         c, s = math.cos(reckoned.angle_rad), math.sin(reckoned.angle_rad)
         return reckoned.x_m + c * ahead - s * left, reckoned.y_m + s * ahead + c * left

@@ -1,8 +1,7 @@
-"""GPS receivers: from fixes to measurements, each in its mode.
+"""GPS receivers: fixes to measurements, each in its mode.
 
-Relative: each receiver is shifted so that its first fix lies at the believed antenna. In a map that all machines share
-this is the transform of a receiver's fixes into the vehicle's own world, by its first fix and the start's roll, pitch
-and yaw (navsat_transform): on the way back into the map the rotations cancel, and this shift is left.
+Relative: a shift puts the first fix at the believed antenna. In a shared map this equals navsat_transform, which moves
+fixes into the vehicle's own world: on the way back the rotations cancel.
 """
 
 import math
@@ -29,20 +28,20 @@ from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, Se
 from protocol.machine.readings import Gps
 from protocol.site.site_config import Projection
 
-AGREED_NS = 3_000_000_000  # so old a fix may be to say whether its receiver agrees with the filter
-MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
+AGREED_NS = 3_000_000_000  # age at which a fix no longer shows whether its receiver agrees
+MIN_DRIFT_M2 = 1e-6  # keeps the covariance regular without slow errors
 
 
 def drifting(sensors: Sequence[SensorConfig]) -> list[SensorConfig]:
-    """Receivers whose slow error matters: it cancels in differences."""
+    """Receivers with a slow error; in differences it cancels."""
     return [s for s in sensors if s.kind == "gps" and s.use and s.mode != DIFFERENTIAL]
 
 
 class Receivers(ModalSensors[Fix]):
-    """The receivers of one machine; `errors` are those of the layout's slow errors, as they are now.
+    """One machine's receivers; `errors`: current slow errors of the layout.
 
-    slow: whether a share of each error is slow, else all of it is white. machine_share: how much of the slow variance
-    they have in common, None to estimate it.
+    slow: whether a share of each error is slow, else all white. machine_share: slow variance in common, None to
+    estimate it.
     """
 
     def __init__(
@@ -59,48 +58,48 @@ class Receivers(ModalSensors[Fix]):
         self._sensors = {s.name: s for s in sensors if s.kind == "gps" and s.use}
         self._projection, self._layout, self._tuning, self._slow = projection, layout, tuning, slow
         self._states = {s.name: i for i, s in enumerate(drifting(sensors))} if slow else {}
-        self._drift_m2 = dict.fromkeys(self._states, MIN_DRIFT_M2)  # variance of the slow error, without an anchor's
-        self._stated_m2: dict[str, float] = {}  # the same, as it was when it last became another one
+        self._drift_m2 = dict.fromkeys(self._states, MIN_DRIFT_M2)  # of the slow error, without an anchor's
+        self._stated_m2: dict[str, float] = {}  # its value at the last significant change
         absolute = [s.name for s in self._sensors.values() if s.mode == ABSOLUTE]
         self._compared = {name: i for i, name in enumerate(absolute)} if slow and machine_share is None else {}
         self._estimator = ShareEstimator(len(absolute), tuning)
         self._configured = machine_share
         self._monitors = {name: InnovationMonitor(tuning if slow else None) for name in self._sensors}
-        self._judged: dict[str, tuple[int, bool]] = {}  # stamp of the last fix of each, and whether it was accepted
+        self._judged: dict[str, tuple[int, bool]] = {}  # stamp of each one's last fix, and whether accepted
         self._refused: Counter[str] = Counter()  # in a row
-        self._off_m: dict[str, list[Floats]] = {}  # innovations of these, since the last relock
-        self._jumps: dict[str, tuple[int, float]] = {}  # stamp, and how far off the receiver was by itself [m2]
-        self._shifts: dict[str, Floats] = {}  # of relative ones, and how unsure the believed antenna was then [m2]
+        self._off_m: dict[str, list[Floats]] = {}  # innovations of refused fixes since the last relock
+        self._jumps: dict[str, tuple[int, float]] = {}  # stamp, and the receiver's squared error [m2]
+        self._shifts: dict[str, Floats] = {}  # of relative ones, and the antenna's variance then [m2]
         self._anchor_m2: dict[str, float] = {}
 
     @property
     def errors(self) -> tuple[GpsError, ...]:
-        """The slow error of each receiver that has states for it; what they share is a source of the machine."""
+        """Slow errors of receivers with states."""
         return tuple(self._error(name) for name in self._states)
 
     def forgotten(self) -> tuple[GpsError, ...]:
-        """The same, once no jump counts any more: what seemed to be one was none."""
+        """The same, after discarding jumps that were none."""
         self._jumps.clear()
         return self.errors
 
     def error_states(self, receiver: str) -> slice | None:
-        """States of the slow error of a receiver; None where the filter has none."""
+        """States of a receiver's slow error; None without."""
         return self._layout.gps_error(self._states[receiver]) if receiver in self._states else None
 
     def variance_factor(self, receiver: str) -> float:
-        """What the variance that a receiver states is taken times [-]."""
+        """Factor applied to a receiver's stated variance [-]."""
         return self._monitors[receiver].variance_factor if receiver in self._monitors else 1.0
 
     @property
     def machine_share(self) -> float | None:
-        """Share of the slow variance that all receivers of the machine have in common; None of fewer than two."""
+        """Share of slow variance common to all receivers; None with fewer than two."""
         if not self._slow or len(self._sensors) < 2:
             return None
         return self._estimator.share if self._configured is None else self._configured
 
     @property
     def consistency(self) -> dict[str, Consistency]:
-        """How consistent the filter is with each receiver, of those with enough fixes."""
+        """Filter consistency with each receiver that has enough fixes."""
         speaking = [name for name, monitor in self._monitors.items() if monitor.consistency()]
         share = self.machine_share
         checks = share is not None and share <= MAX_SHARE and sum(n in self._states for n in speaking) > 1
@@ -108,7 +107,7 @@ class Receivers(ModalSensors[Fix]):
         return {name: value for name, value in judged.items() if value}
 
     def fix(self, gps: Gps, reckoned: DeadReckonedPose) -> Fix:
-        """A reading in `map`, with the variances that are configured, else its own, as its innovations correct them."""
+        """A reading in `map`, with configured variances, else its own, times its factor."""
         sensor, factor = self._sensors[gps.sensor], self.variance_factor(gps.sensor)
         x, y, _ = self._projection.to_map(gps.lat_deg, gps.lon_deg, gps.height_m)
         stated = (gps.var_e_m2, gps.var_n_m2)
@@ -122,18 +121,18 @@ class Receivers(ModalSensors[Fix]):
         self._anchor_m2[fix.sensor.name] = float(np.trace(H @ belief.P @ H.T)) / 2
 
     def measurement(self, fix: Fix) -> Measurement | None:
-        """A place, or of a differential receiver a velocity; None where no fix before makes a pair with this one."""
+        """A position, or a velocity of a differential receiver; None without an earlier fix."""
         return self._velocity(fix) if fix.sensor.mode == DIFFERENTIAL else self._position(fix)
 
     def confirm(self, fix: Fix, result: Conditioned) -> None:
-        """Note what the filter made of a fix: the receiver's error has its first value now."""
+        """Note the filter's result; the receiver's error is no longer new."""
         super().confirm(fix, result)
         name = fix.sensor.name
         if name in self._states and (name not in self._stated_m2 or self._is_restated(name)):
             self._stated_m2[name] = self._drift_m2[name]
         self._monitors[name].note(result, self._believed_error(name, result.belief))
         if fix.sensor.mode == DIFFERENTIAL or not math.isfinite(result.nis):
-            return  # a velocity says nothing of the place
+            return
         self._judged[name] = (fix.stamp_ns, result.accepted)
         if not result.accepted:
             self._refused[name] += 1
@@ -156,19 +155,18 @@ class Receivers(ModalSensors[Fix]):
             self._estimator.add(shared, float(result.belief.x[YAW]) - fix.reckoned.angle_rad)
 
     def _believed_error(self, name: str, belief: Belief) -> float | None:
-        """Square of a receiver's slow error as it is believed over its variance, per component; None without states."""
         if (states := self.error_states(name)) is None:
             return None
         error = belief.x[states]
         return float(error.dot(error)) / 2 / self._error(name).variance_m2
 
     def _error(self, name: str) -> GpsError:
-        """The slow error of a receiver, as it is now: with the part that the machine's receivers have in common."""
+        """The current slow error."""
         drift_m2, time_s, anchor_m2 = self._drift_m2[name], self._sensors[name].drift_time_s, self._anchor_m2.get(name)
         common_m2 = min(self.machine_share or 0.0, MOST_SHARED) * drift_m2
-        # of a relative one both the error now and that of the first fix count, and where the filter was wrong then
+        # a relative one has errors now, at its first fix, and the filter's then
         variance_m2 = drift_m2 if anchor_m2 is None else 2 * drift_m2 + anchor_m2
-        if name in self._jumps:  # it errs as far as it jumped, for as long as its errors last
+        if name in self._jumps:  # it errs by its jump, for the lifetime of its errors
             jumped_ns, jump_m2 = self._jumps[name]
             variance_m2 += jump_m2 * math.exp((jumped_ns - self._judged[name][0]) * 1e-9 / time_s)
         return GpsError(variance_m2, time_s, common_m2)
@@ -181,7 +179,7 @@ class Receivers(ModalSensors[Fix]):
         if self._slow:
             error = self._layout.gps_error(self._states[sensor.name])
             self._drift_m2[sensor.name] = drift_m2 = _drift_m2(fix)
-            if sensor.name not in self._confirmed:  # a receiver brings its own unknown error
+            if sensor.name not in self._confirmed:  # its error is unknown
                 change = self._joining(fix, error)
             elif self._is_restated(sensor.name):
                 before_m2 = self._stated_m2[sensor.name]
@@ -189,26 +187,26 @@ class Receivers(ModalSensors[Fix]):
             if self.is_outvoted(fix):
                 opens = (error,)
             elif not self._votes(fix) and self._has_jumped(fix.sensor.name, _mean(self._white(fix))):
-                # nobody tells whether receiver or filter went wrong: the motion will show
+                # whether receiver or filter is wrong, motion will show
                 opens = (measurements.PLACE, error)
         R = np.diag(self._white(fix))
         gate = sensor.gate(self._tuning.gps_gate_sigma)
         return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, gate, opens, change)
 
     def _is_restated(self, name: str) -> bool:
-        """Whether a receiver states so much more or less than before that its slow error is another one."""
+        """Whether a stated variance changed so much that the error is another one."""
         times = self._tuning.restated
         return not 1 / times < self._drift_m2[name] / self._stated_m2[name] < times
 
     def is_outvoted(self, fix: Fix) -> bool:
-        """Whether as many other receivers agree with the filter as do not: then a refused one errs, not the filter."""
+        """Whether most other receivers agree with the filter; then a refused one is wrong."""
         votes = self._votes(fix)
         return sum(votes) > votes.count(False)
 
     def _has_jumped(self, name: str, white_m2: float) -> bool:
-        """Whether refused fixes get no further off: one jump did it, of the receiver or the place.
+        """Whether refused fixes drift no further, so that receiver or position jumped.
 
-        Else the motion is wrong, as with a wheel that is stuck or a machine that is carried, and will show nothing.
+        Else the motion is wrong, as with a stuck wheel, and shows nothing.
         """
         off_m, half = self._off_m.get(name), self._tuning.relock // 2
         if not off_m:
@@ -217,12 +215,11 @@ class Receivers(ModalSensors[Fix]):
         return last_m - first_m < self._tuning.gps_gate_sigma * math.sqrt(2 * white_m2 / half)
 
     def _votes(self, fix: Fix) -> list[bool]:
-        """Of each other receiver that is heard: whether it agrees with the filter."""
         since_ns = fix.stamp_ns - AGREED_NS
         return [accepted for name, (ns, accepted) in self._judged.items() if ns > since_ns and name != fix.sensor.name]
 
     def _joining(self, fix: Fix, states: slice) -> Change:
-        """What gives the receiver's error its first value, by those of the receivers before it."""
+        """First value of a receiver's error, given earlier receivers."""
         if not fix.is_absolute:
             return partial(_anchor_antenna, states=states, lever_m=fix.lever_m, variance=2 * _drift_m2(fix))
         names = [n for n in self._states if n in self._confirmed and self._sensors[n].mode == ABSOLUTE]
@@ -235,7 +232,7 @@ class Receivers(ModalSensors[Fix]):
         return partial(_join, states=states, H=H, variance=variance)
 
     def _velocity(self, fix: Fix) -> Measurement | None:
-        """Of the antenna, between the last fix and this one: slow errors cancel but for what they change meanwhile."""
+        """Antenna velocity between two fixes: slow errors cancel but for their change."""
         sensor, now = fix.sensor, StampedValue(fix.stamp_ns, fix.position_m, self._white(fix))
         before, mean = self._last.get(sensor.name, now), self._rate(sensor.name, now)
         if mean is None:
@@ -248,7 +245,7 @@ class Receivers(ModalSensors[Fix]):
         )
 
     def _differential_m2(self, fix: Fix) -> float:
-        """Variance of the slow error, so much larger that receivers which share it are together no better than one."""
+        """Slow variance, inflated so that receivers sharing it count as one."""
         others = sum(s.mode == DIFFERENTIAL for s in self._sensors.values()) - 1
         return _drift_m2(fix) * (1 + others * (self.machine_share or 0.0))
 
@@ -260,24 +257,23 @@ class Receivers(ModalSensors[Fix]):
 
 
 def _mean(variance_m2: Floats) -> float:
-    """Of both axes: a tenth of the time of `mean`."""
+    """Over both axes; ten times as fast as `mean`."""
     east_m2, north_m2 = variance_m2.tolist()
     return float(east_m2 + north_m2) / 2
 
 
 def _drift_m2(fix: Fix) -> float:
-    """Variance of the slow error."""
     return max(fix.sensor.drift_share * _mean(fix.variance_m2), MIN_DRIFT_M2)
 
 
 def _antenna(belief: Belief, lever_m: Floats) -> tuple[Floats, Floats]:
-    """Where the antenna is believed (2,) in `map`, and the Jacobian (2, n) of that."""
+    """Believed antenna (2,) in `map`, and its Jacobian (2, n)."""
     model = measurements.fix(belief.stamp_ns, "", np.zeros(2), np.eye(2), lever_m, None, 0.0)
     return model.h(belief.x[None])[0], model.jacobian(belief.x)
 
 
 def _join(belief: Belief, states: slice, H: Floats, variance: float) -> Belief:
-    """The belief with states e (k,) for an error of which others tell a part: e = -H x + v."""
+    """Set states e (k,) to an error partly known from others: e = -H x + v."""
     joined = anchor_states(belief, states, H, variance)
     x = joined.x.copy()
     x[states] = -H @ belief.x

@@ -1,14 +1,12 @@
-"""Attitude references: from orientations to measurements, each in its mode.
+"""Attitude references: orientations to measurements, each in its mode.
 
-Absolute: orientations are measurements of the filter step that they came in. The error of a magnetic heading is slow:
-it comes from the machine's own steel, from iron and currents near by and from the calibration, and lasts for tens of
-metres to for ever. So each absolute heading has a state for it, a Gauss-Markov process: while GPS shows the heading the
-error is learnt, and without GPS the heading is held to within what the error may have changed since. The profile
-`paper` takes orientations as they are, with white errors, and their tilt too.
+Absolute: measured at the filter step. Magnetic heading errors are slow: the machine's steel, nearby iron and currents,
+and calibration last from tens of metres to for ever. So each has a Gauss-Markov state, learnt while GPS shows the
+heading; without GPS the heading holds to within its change. Profile `paper` takes orientations with white errors, tilt
+included.
 
-Differential: successive orientations make an angular rate. Relative: the heading is turned so that the first one agrees
-with the believed heading; roll and pitch stay, since gravity gives them. Differential and relative ones are
-measurements of their own stamps.
+Differential: successive orientations give an angular rate. Relative: the heading is turned so that its first value
+agrees with the believed one; roll and pitch stay, as gravity gives them. Both keep their own stamps.
 """
 
 import math
@@ -30,33 +28,30 @@ from protocol.machine.machine_config import ABSOLUTE, BASE, RELATIVE, SensorConf
 from protocol.machine.readings import Attitude
 from protocol.rotations import matrix_from_quaternion, rpy_from_matrix
 
-UNKNOWN_STD = 1e4  # of a quantity that a sensor does not measure
+UNKNOWN_STD = 1e4  # of unmeasured quantities
 
 
 @dataclass(frozen=True)
 class Orientation:
-    """Roll, pitch and yaw [rad] of `base_link` by a reference."""
+    """Roll, pitch, yaw [rad] of `base_link` by a reference."""
 
     sensor: SensorConfig
     value: StampedValue
 
     @property
     def stamp_ns(self) -> int:
-        """When it was measured."""
+        """Stamp of the measurement."""
         return self.value.stamp_ns
 
 
 def heading_references(sensors: Sequence[SensorConfig]) -> list[SensorConfig]:
-    """References with a state for their heading's error: absolute ones, then those that count from a believed one."""
+    """References with a heading error state: absolute ones, then anchored ones."""
     able = [s for s in sensors if s.kind == "attitude" and s.use and s.frame == BASE and s.provides("heading")]
     return [s for mode in (ABSOLUTE, RELATIVE) for s in able if s.mode == mode]
 
 
 class References(ModalSensors[Orientation]):
-    """The attitude references of one machine; `errors` are those of the absolute headings, as they are now.
-
-    slow: whether errors of absolute ones are slow, else white.
-    """
+    """One machine's attitude references; `errors`: of absolute headings; slow: whether these are slow, else white."""
 
     def __init__(
         self, sensors: Sequence[SensorConfig], layout: Layout, tuning: LocalisationTuning = TUNING, *, slow: bool
@@ -74,11 +69,11 @@ class References(ModalSensors[Orientation]):
 
     @property
     def errors(self) -> tuple[HeadingError, ...]:
-        """The error of each absolute heading that has a state for it."""
+        """Errors of absolute headings that have states."""
         return tuple(self._errors.values())
 
     def measurements(self, step: FilterStep, belief: Belief) -> list[Measurement]:
-        """Measurements of absolute references, at the stamp of the step; belief: the newest."""
+        """Measurements of absolute references at the step's stamp; belief: the newest."""
         absolute = [a for a in step.attitudes.values() if self._sensors[a.sensor].mode == ABSOLUTE]
         if not self._slow:
             return [self._attitude(o, step.stamp_ns, o.value.values) for o in map(self._orientation, absolute)]
@@ -89,7 +84,7 @@ class References(ModalSensors[Orientation]):
         return [m for a in due for m in self._heading(self._orientation(a), step.stamp_ns, belief)]
 
     def own_stamped(self, step: FilterStep) -> list[Orientation]:
-        """Orientations of the other references, which become measurements of their own stamps."""
+        """Orientations of other references, measured at their own stamps."""
         return [self._orientation(a) for a in step.attitudes.values() if self._sensors[a.sensor].mode != ABSOLUTE]
 
     def anchor(self, orientation: Orientation, belief: Belief) -> None:
@@ -97,7 +92,7 @@ class References(ModalSensors[Orientation]):
         self._turns[orientation.sensor.name] = float(belief.x[YAW] - orientation.value.values[2])
 
     def measurement(self, orientation: Orientation) -> Measurement | None:
-        """A turned attitude, or of a differential reference an angular rate; None where there is no pair."""
+        """A turned attitude, or an angular rate of a differential reference; None without a pair."""
         sensor, value = orientation.sensor, orientation.value
         if sensor.mode != RELATIVE:
             return self._rotation(sensor, value)
@@ -105,7 +100,7 @@ class References(ModalSensors[Orientation]):
         return self._attitude(orientation, value.stamp_ns, turned, self._first_change(orientation))
 
     def _orientation(self, attitude: Attitude) -> Orientation:
-        """With the variances that are configured, else its own; wide open where the sensor does not measure."""
+        """With configured variances, else its own; unmeasured angles are wide open."""
         sensor, names = self._sensors[attitude.sensor], ("tilt", "tilt", "heading")
         own = attitude.var_roll_rad2, attitude.var_pitch_rad2, attitude.var_yaw_rad2
         stated = [sensor.std[n] ** 2 if n in sensor.std else v for n, v in zip(names, own, strict=True)]
@@ -114,11 +109,11 @@ class References(ModalSensors[Orientation]):
         return Orientation(sensor, StampedValue(attitude.stamp_ns, angles, variances))
 
     def _heading(self, orientation: Orientation, stamp_ns: int, belief: Belief) -> list[Measurement]:
-        """The heading of a reference, with the state of its error.
+        """A reference's heading, with its error state.
 
-        An error that turns out larger than stated is taken for that large, and to change as fast as one of the stated
-        size (2 std^2 / time stays): else it would be expected to fade, and the believed heading would follow it.
-        References of one machine stand in one magnetic field: several count as one.
+        An error larger than stated gets that size and keeps its rate of change (2 std^2 / time); else it would be
+        expected to fade, and pull the heading along. References of one machine share one magnetic field, so several
+        count as one.
         """
         sensor = orientation.sensor
         if sensor.name not in self._errors:
@@ -150,7 +145,7 @@ class References(ModalSensors[Orientation]):
         )
 
     def _first_change(self, orientation: Orientation) -> Change | None:
-        """Gives the state of the anchor's error its first value."""
+        """First value of the anchor's error state."""
         name = orientation.sensor.name
         if name in self._confirmed or name not in self._states:
             return None
@@ -158,7 +153,7 @@ class References(ModalSensors[Orientation]):
         return partial(_anchor_heading, states=states, variance=float(orientation.value.variances[2]))
 
     def _rotation(self, sensor: SensorConfig, now: StampedValue) -> Measurement | None:
-        """Angular rate between the last orientation and this one: E^-1 makes it from rates of roll, pitch and yaw."""
+        """Angular rate between two orientations: E^-1 converts rates of roll, pitch and yaw."""
         mean = self._rate(sensor.name, now, angles=True)
         if mean is None:
             return None

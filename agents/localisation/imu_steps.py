@@ -1,4 +1,4 @@
-"""Readings of fast sensors gathered into filter steps: means of IMUs in `base_link`, the wheels' speed at the end."""
+"""Fast readings gathered into filter steps: IMU means in `base_link`, wheel speed at the end."""
 
 import math
 from collections import Counter
@@ -33,12 +33,12 @@ from protocol.machine.readings import (
 Sensed = tuple[Reading, SensorConfig]
 PLACES = (Gps, GpsVelocity)
 NOTHING = (0.0,) * 7  # count and sums
-MIN_NORM = 0.5  # a reference that has not settled yet sends a quaternion of zeros
+MIN_NORM = 0.5  # an unsettled reference sends a zero quaternion
 
 
 @dataclass(frozen=True)
 class ImuMean:
-    """Mean angular rate and specific force of one IMU over a step, (3,) each, in `base_link`."""
+    """An IMU's mean angular rate and specific force over a step, (3,) each, in `base_link`."""
 
     rates_radps: Floats
     force_mps2: Floats
@@ -46,10 +46,10 @@ class ImuMean:
 
 @dataclass(frozen=True)
 class Turn:
-    """Mean turn rate [rad/s] over a step, of odometry or steering.
+    """Mean turn rate [rad/s] over a step, by odometry or steering.
 
-    per_error: what the sensor's lasting error makes of it: of odometry, whose error is a rate, 1; of steering, whose
-    error is a curvature [1/m], the speed.
+    per_error: effect of the sensor's lasting error: 1 for odometry (a rate); the speed for steering (a curvature
+    [1/m]).
     """
 
     rate_radps: float
@@ -58,12 +58,11 @@ class Turn:
 
 @dataclass(frozen=True)
 class FilterStep:
-    """Readings of fast sensors since the step before, up to a stamp.
+    """Fast readings since the last step.
 
-    reckoned: the dead-reckoned pose at its end. attitudes: the last one of each attitude reference that can be used.
-    wheels: their speed at its end, or that over ground while they are silent. rolled: whether they were read in this
-    step, and show a speed. traction: drive force over weight; still_s: how long without travel. turn: of a machine
-    without IMU. silent: whether wheels are missing, or have been silent for long.
+    reckoned: dead-reckoned pose at its end. attitudes: last usable one per reference. wheels: speed at its end, over
+    ground while silent. rolled: wheels were read and show a speed. traction: drive force over weight; still_s: time
+    without travel. turn: without IMU. silent: wheels are missing or long silent.
     """
 
     stamp_ns: int
@@ -92,16 +91,16 @@ class StepGatherer:
         self._turn_sensor = source.name if source else ""
         self._steers = source is not None and source.kind == "steering"
         self._wheelbase_m = machine.wheelbase_m
-        self._turn_values: list[float] = []  # rates of odometry, or curvatures of steering
+        self._turn_values: list[float] = []  # odometry rates, or steering curvatures
         self._begin_ns = 0
         self._sensed_ns = 0
-        self._joint = WheelTracker()  # the angle of articulation, smoothed in the same manner
+        self._joint = WheelTracker()  # low-passed articulation angle
         self._rolled = False
 
     def gather(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> FilterStep | None:
-        """Add the readings of one stamp, after dead reckoning took them; returns the step that they end.
+        """Add one stamp's readings, after dead reckoning; returns the step they complete.
 
-        Those of GPS end one only where no other sensor has been heard for long.
+        GPS readings complete one only after long silence of other sensors.
         """
         stamp_ns = readings[0][0].stamp_ns
         is_sensed = False
@@ -135,7 +134,7 @@ class StepGatherer:
             self._turn_values.append(reading.rate_z_radps)
 
     def _add_imu(self, imu: Imu, sensor: SensorConfig) -> None:
-        """Sum up an IMU's readings in its own axes; their mean is turned once per step, as turning is linear."""
+        """Sum in sensor axes; turning is linear, so the mean is turned once per step."""
         if sensor.frame == FRONT and not self._joint.is_settled:
             self.counters["front_imu_without_articulation"] += 1
             return
@@ -151,14 +150,13 @@ class StepGatherer:
         )
 
     def _mean(self, name: str) -> ImuMean:
-        """Mean of an IMU over the step, in `base_link`."""
         n, *total = self._sums[name]
         frame_from_sensor = self._rotations[name]
         rates, force = (np.array(total).reshape(2, 3) / n).dot(frame_from_sensor.T)
         return ImuMean(*(self._to_base(rates, force) if name in self._front else (rates, force)))
 
     def _add_attitude(self, attitude: Attitude, sensor: SensorConfig) -> None:
-        """Keep an orientation that can be used; one of the front frame cannot."""
+        """Keep a usable orientation; the front frame's is not."""
         if sensor.frame == FRONT:
             self.counters["front_attitude_unused"] += 1
         elif math.hypot(attitude.qx, attitude.qy, attitude.qz, attitude.qw) < MIN_NORM:
@@ -167,7 +165,7 @@ class StepGatherer:
             self._attitudes[attitude.sensor] = attitude
 
     def _to_base(self, rates: Floats, force: Floats) -> tuple[Floats, Floats]:
-        """Values of the front frame in `base_link`: turned by the articulation in mid-step, less its rate."""
+        """Front-frame values in `base_link`: turned by the mid-step articulation, less its rate."""
         angle = self._joint.travel_m - 0.5e-9 * self._step_ns * self._joint.speed_mps
         c, s = math.cos(angle), math.sin(angle)
         base_from_front = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -187,7 +185,7 @@ class StepGatherer:
         return FilterStep(stamp_ns, reckoned, imu_means, attitudes, wheels, rolled, traction, still_s, turn, silent)
 
     def _turn(self, wheels: WheelSpeed) -> Turn | None:
-        """By the readings of this step; steering shows no turn without a speed."""
+        """By this step's readings; steering needs a speed."""
         values, self._turn_values = self._turn_values, []
         mean = sum(values) / len(values)
         if not self._steers:

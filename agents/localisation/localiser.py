@@ -1,8 +1,8 @@
-"""The localiser: readings in, poses out. It collects until the heading shows, then judges it until it is proven.
+"""The localiser: readings to poses. It collects until the heading shows, then tests it until it is proven.
 
-A heading that GPS shows may be wrong: a receiver that has just started is tens of metres off, and says so or not. So it
-is unproven at first, and all events are kept. A receiver that the filter refuses so often that it relocks takes such a
-heading back: what came before its refusals counts no longer, and the rest is aligned and filtered again.
+A heading by GPS may be wrong, as a receiver that has just started is tens of metres off. So it is unproven at first,
+and all events are kept. If the filter refuses a receiver until it relocks, the heading is withdrawn: events before the
+refusals no longer count, the rest is aligned and filtered again.
 """
 
 import math
@@ -32,28 +32,27 @@ from protocol.machine.readings import Gps, GpsVelocity
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
-STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
-COLLECTED = 24_000  # steps, fixes and poses kept while the heading is unproven: 20 minutes
-PROVEN_S = 30.0  # without refusals, after which a heading is proven if the machine has driven DISTANCE_M once more
-UNSIGNED_M = 60.0  # way over ground after which its first motion is taken for one ahead: the speed may never change
-REFUTED_SIGMA = 3.0  # a proven heading is refuted if refused fixes show one that is further off
+STEP_S = 0.05  # time step of the filter; cost grows with its inverse
+COLLECTED = 24_000  # capacity in events while the heading is unproven: 20 minutes
+PROVEN_S = 30.0  # time without refusals, over a further DISTANCE_M, that proves a heading
+UNSIGNED_M = 60.0  # distance after which a first motion over ground counts as ahead: its speed may never change
+REFUTED_SIGMA = 3.0  # deviations by which refused fixes refute a proven heading
 FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
 MAP_AIDS = ("auto", "off")
-MAX_LAG_S = 3600.0  # each second of it is a node to smooth
+MAX_LAG_S = 3600.0  # each second is a node to smooth
 
 
 @dataclass(frozen=True)
 class LocalisationConfig:
     """How positions are found.
 
-    filter: ekf or ukf. profile: "paper" takes GPS errors as white, and runs filterpy's filters (extra `paper`);
-    "default" estimates a slow error of each receiver, a bias of each yaw gyro and the wheels' scale, with our own.
-    start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. It counts
-    once: after a pause or a jump of the clock the machine may be anywhere. slip, slip_soft: wheel slip per traction on
-    firm ground, and how much it rises with the rolling resistance; of the tyres. lag_s: how long places of the past are
-    smoothed by what comes after them, 0 for not at all; "paper" never smooths. map_aid: "auto" finds the machine's lane
-    on the map that all machines draw, once there is one; "off" never does, nor does "paper".
+    filter: ekf or ukf. profile: "paper" takes GPS errors as white, with filterpy's filters (extra `paper`); "default"
+    estimates a slow error per receiver, a bias per yaw gyro and the wheel scale. start: x, y [m] and heading [rad] in
+    `map`, if known: then alignment and GPS are not needed. It counts once: after a pause or clock jump the machine may
+    be anywhere. slip, slip_soft: wheel slip per traction on firm ground, and its rise with rolling resistance; of the
+    tyres. lag_s: lag of the smoother, 0 for none; "paper" has none. map_aid: "auto" finds the machine's lane on the
+    shared map; "off" and "paper" do not.
     """
 
     filter: str = "ukf"
@@ -80,17 +79,17 @@ class LocalisationConfig:
 
     @property
     def smoothing_s(self) -> float:
-        """The lag of the smoother; 0 for the profile `paper`, whose method has none."""
+        """Lag of the smoother; 0 in profile `paper`."""
         return self.lag_s if self.profile == "default" else 0.0
 
     @property
     def uses_lanes(self) -> bool:
-        """Whether the lanes of all machines are used."""
+        """Whether lanes of the shared map are used."""
         return self.map_aid == "auto" and self.profile == "default"
 
 
 class HeadingRefutedError(ArithmeticError):
-    """A proven heading is wrong. off_m: how far the place was off when that showed."""
+    """A proven heading is wrong. off_m: position error when that showed."""
 
     def __init__(self, off_m: float) -> None:
         super().__init__(f"the heading is wrong, the place by {off_m:.0f} m")
@@ -98,10 +97,10 @@ class HeadingRefutedError(ArithmeticError):
 
 
 class Localiser:
-    """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order.
+    """Fuses GPS, IMUs and wheels into 15 states and slow sensor errors, from readings in nearly any order.
 
-    engine: the filter; an experiment may put one that watches it in its place, before the first reading. is_weighed:
-    whether the machine's load is known. is_proven: whether poses may become samples. watch: whether places have jumped.
+    engine: the filter; experiments may replace it before the first reading. is_weighed: whether the load is known.
+    is_proven: whether poses may become samples. watch: for position jumps.
     """
 
     def __init__(
@@ -115,7 +114,7 @@ class Localiser:
         lanes: LaneAid | None = None,
         tuning: LocalisationTuning = TUNING,
     ) -> None:
-        """lanes: those of all machines, as this one uses them."""
+        """Start; `lanes` are those of the shared map."""
         self.engine = _engine(config)
         self.is_proven = False
         self.watch = PlaceWatch()
@@ -128,14 +127,14 @@ class Localiser:
         self._gatherer = StepGatherer(machine, step_s)
         self._repeats = Repeats()
         self._accelerometers = [s.name for s in machine.sensors if s.kind == "imu" and s.use and s.provides("force")]
-        self._sign = TravelSign() if self._accelerometers and not config.start else None  # None: known, or not shown
+        self._sign = TravelSign() if self._accelerometers and not config.start else None  # None: known or not shown
         self._stepped_ns = 0
         self._counters: Counter[str] = Counter()
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
         self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
-        self._refused: deque[Fix] = deque(maxlen=COLLECTED)  # since the filter took one
-        self._since: tuple[int, float] = (0, 0.0)  # stamp of the first fix that counts, and the way at the alignment
+        self._refused: deque[Fix] = deque(maxlen=COLLECTED)  # since the last accepted one
+        self._since: tuple[int, float] = (0, 0.0)  # stamp of the first fix that counts, and distance at the alignment
         self._aligned_scale = 0.0  # of the wheels, by the newest alignment
         self._poses: deque[PoseBelief] = deque(maxlen=COLLECTED)  # of the unproven heading
         self._smoothed: list[SmoothedPose] = []
@@ -153,42 +152,42 @@ class Localiser:
 
     @property
     def repeating(self) -> list[str]:
-        """Names of receivers that have repeated one value for long while the machine moved."""
+        """Receivers that keep repeating one value while the machine moves."""
         return self._repeats.lasting
 
     @property
     def consistency(self) -> dict[str, Consistency]:
-        """How consistent the filter is with each GPS receiver, of those with enough fixes."""
+        """Filter consistency with each GPS receiver that has enough fixes."""
         return self._tracker.receivers.consistency
 
     def variance_factor(self, receiver: str) -> float:
-        """What the variance that a receiver states is taken times [-]."""
+        """Factor applied to a receiver's stated variance [-]."""
         return self._tracker.receivers.variance_factor(receiver)
 
     def slow_error_m(self, receiver: str) -> Floats:
-        """The believed slow error of a receiver (2,), east and north [m]; zeros where it is no state."""
+        """Estimated slow error of a receiver (2,), east and north [m]; zeros if it is no state."""
         return self._tracker.slow_error_m(receiver)
 
     @property
     def machine_share(self) -> float | None:
-        """Share of the slow variance that the receivers have in common, as it is taken for; None of fewer than two."""
+        """Assumed share of slow variance common to the receivers; None with fewer than two."""
         return self._tracker.receivers.machine_share
 
     @property
     def wheel_scale(self) -> float | None:
-        """How much further the wheels turn than the machine moves [-]; None where it is no state.
+        """Wheel travel over machine travel, less 1; None if it is no state.
 
-        As believed; while the heading is unproven, as the fixes showed it that aligned it.
+        As estimated; by the alignment's fixes while the heading is unproven.
         """
         return self._aligned_scale if self.is_aligned and not self.is_proven else self._tracker.wheel_scale
 
     @property
     def belief(self) -> Belief | None:
-        """The whole state, once it is known."""
+        """The whole state, once known."""
         return self._tracker.belief
 
     def take_smoothed(self) -> list[SmoothedPose]:
-        """Smoothed poses that became final since the last call, oldest first; none of an unproven heading."""
+        """Newly final smoothed poses, oldest first; none of an unproven heading."""
         if self._tracker.fusion:
             self._smoothed += self._aided(self._tracker.fusion.take_smoothed())
         if not self.is_proven:
@@ -197,23 +196,22 @@ class Localiser:
         return taken
 
     def remaining(self) -> list[SmoothedPose]:
-        """Smoothed poses that are not final, as known by now; the last is the newest belief's. They stay."""
+        """Smoothed poses not yet final, the newest belief's last; they stay."""
         fusion = self._tracker.fusion
         return self._smoothed + self._aided(fusion.remaining()) if fusion else []
 
     def _aided(self, poses: list[SmoothedPose]) -> list[SmoothedPose]:
-        """The poses with what came from lanes of each."""
         return [replace(pose, aid_share=self._tracker.aid_share(pose.cross)) for pose in poses]
 
     def doubt(self, off_m: float, off_mps: float) -> float:
-        """Be less sure of place and speed, as wheels that count no longer have led both astray; returns the heading."""
+        """Widen position and speed after bad wheels misled both; returns the heading."""
         return self._tracker.doubt(off_m, off_mps)
 
     def update(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[PoseBelief]:
-        """Take in the readings of one stamp, after dead reckoning did; returns poses that became possible or changed.
+        """Add the readings of one stamp, after dead reckoning; returns new or changed poses in stamp order.
 
-        In the order of their stamps; those of an unproven heading once more when it is proven. Raises
-        HeadingRefutedError where a proven heading is wrong: nothing is left to go on with but a new start.
+        Poses of an unproven heading come again once it is proven. HeadingRefutedError: a proven heading is wrong; only
+        a new start helps.
         """
         distance_m, was_proven = dead_reckoning.distance_m, self.is_proven
         beliefs: list[Belief] = []
@@ -221,7 +219,7 @@ class Localiser:
             if isinstance(event, FilterStep) and event.silent and self._sign:
                 self._judge_sign(self._sign, event, dead_reckoning)
             beliefs += self._filter(event, distance_m) if self.is_aligned else self._collect(event, distance_m)
-        if was_proven and not beliefs:  # as mostly
+        if was_proven and not beliefs:  # the usual case
             return []
         wheels_mps = None if dead_reckoning.is_silent(readings[0][0].stamp_ns) else dead_reckoning.wheels.speed_mps
         poses = [pose_of(belief, wheels_mps, self._tracker.aid_share(belief.P)) for belief in beliefs]
@@ -231,22 +229,21 @@ class Localiser:
         return self._proven_poses() if self.is_proven else poses
 
     def conclude(self, distance_m: float) -> list[PoseBelief]:
-        """Prove the heading by what there is, as no more may come; returns the poses that may become samples now."""
+        """Prove the heading at the end of the data; returns the poses that may become samples."""
         if self.is_proven or not self._holds(distance_m):
             return []
         self.is_proven = True
         return self._proven_poses()
 
     def _judge_sign(self, sign: TravelSign, step: FilterStep, dead_reckoning: DeadReckoning) -> None:
-        """Judge whether speeds over ground have the right sign: their first motion may have been one in reverse.
+        """Check the sign of speeds over ground, as the first motion may have been in reverse.
 
-        What was collected until then has the wrong one, and does not count. Raises HeadingRefutedError where a proven
-        heading came of it.
+        If wrong, what was collected is discarded. HeadingRefutedError if it led to a proven heading.
         """
         dt_s, self._stepped_ns = (step.stamp_ns - self._stepped_ns) * 1e-9, step.stamp_ns
         for mean in (step.imu_means[name] for name in self._accelerometers if name in step.imu_means):
             sign.add_force(float(mean.force_mps2[0]), -float(mean.rates_radps[1]), dt_s)
-            break  # one is enough
+            break
         if dead_reckoning.ground:
             sign.add_speed(dead_reckoning.ground.middle_ns, dead_reckoning.ground.speed_mps)
         if not (shown := sign.sign):
@@ -263,7 +260,7 @@ class Localiser:
                 kept.clear()
 
     def _events(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[Event]:
-        """What the filter takes of the readings of one stamp; a step that they end comes first."""
+        """Filter events of one stamp's readings; a completed step comes first."""
         events: list[Event] = []
         for reading, sensor in readings:
             if isinstance(reading, Gps):
@@ -275,7 +272,7 @@ class Localiser:
         return [step, *events] if step else events
 
     def _filter(self, event: Event, distance_m: float) -> list[Belief]:
-        """Beliefs that an event changed; a fix may prove the heading, or take it back."""
+        """Beliefs that an event changed; a fix may prove or withdraw the heading."""
         if not self.is_proven:
             self._remember(event)
         self._tracker.lanes = self._lanes if self.is_proven else None
@@ -287,7 +284,7 @@ class Localiser:
         return beliefs
 
     def _contradiction(self, fix: Fix) -> Alignment | None:
-        """What refused fixes show instead, once they are too many; HeadingRefutedError where a heading was proven."""
+        """The alignment by refused fixes, once too many; HeadingRefutedError if it refutes a proven heading."""
         if self._tracker.is_accepted(fix):
             self._refused.clear()
             self.watch.look(fix.stamp_ns)
@@ -310,9 +307,9 @@ class Localiser:
         return None
 
     def _take_back(self, shown: Alignment, distance_m: float) -> list[Belief]:
-        """Start again with what came since the filter refused fixes, and with what they show.
+        """Restart from the refusals, with the alignment they show.
 
-        Steps from before the refuted heading are dropped: else each new start would filter more than the one before.
+        Steps before the refuted heading are dropped, else each restart would filter more than the last.
         """
         self._counters["heading_taken_back"] += 1
         self._tracker = Tracker(self._tracker_config)
@@ -325,7 +322,6 @@ class Localiser:
         return self._start(shown, distance_m)
 
     def _forget(self, before_ns: int) -> None:
-        """Let fixes and velocities of a first stretch that is off no longer count."""
         self._counters["fix_before_alignment"] += sum(fix.stamp_ns < before_ns for fix in self._fixes)
         for kept in (self._fixes, self._velocities):
             while kept and kept[0].stamp_ns < before_ns:
@@ -335,18 +331,18 @@ class Localiser:
         return fix.stamp_ns - self._since[0] >= PROVEN_S * 1e9
 
     def _holds(self, distance_m: float) -> bool:
-        """Whether the machine has driven far enough for a wrong heading to show, and no fix is refused."""
+        """Whether a wrong heading would have shown by now, and no fix is refused."""
         return self.is_aligned and distance_m - self._since[1] >= DISTANCE_M and not self._refused
 
     def _keep(self, poses: Sequence[PoseBelief]) -> None:
-        """Keep poses of an unproven heading; one replaces those that are not older."""
+        """Keep poses of an unproven heading; later ones replace those not older."""
         for pose in poses:
             while self._poses and pose.stamp_ns <= self._poses[-1].stamp_ns:
                 self._poses.pop()
             self._poses.append(pose)
 
     def _proven_poses(self) -> list[PoseBelief]:
-        """All poses since the start; nothing is kept any longer."""
+        """All poses since the start; buffers are cleared."""
         poses = list(self._poses)
         for kept in (self._poses, self._steps, self._fixes, self._velocities):
             kept.clear()
@@ -361,10 +357,10 @@ class Localiser:
             self._steps.append(event)
 
     def _collect(self, event: Event, distance_m: float) -> list[Belief]:
-        """Keep an event until the heading is known, then filter all that was kept."""
+        """Keep an event until the heading is known, then filter everything."""
         is_blind = isinstance(event, FilterStep) and event.silent and not event.wheels.is_known
         if is_blind and not self._config.start:
-            return []  # nothing to start from before it moved
+            return []  # no start before it has moved
         self._remember(event)
         alignment: Alignment | None = None
         if isinstance(event, FilterStep):
@@ -374,11 +370,10 @@ class Localiser:
         return self._start(alignment, distance_m) if alignment else []
 
     def _least_m(self) -> float:
-        """Way before the heading is taken from GPS."""
         return UNSIGNED_M if self._sign and self._steps[-1].silent else DISTANCE_M
 
     def _start(self, alignment: Alignment, distance_m: float) -> list[Belief]:
-        """Filter all that was kept. A start that is given needs no proof, nor has the profile `paper` any."""
+        """Filter everything kept. A configured start and profile `paper` need no proof."""
         self._forget(alignment.since_ns)
         self._aligned_scale = alignment.wheel_scale
         self._since = self._fixes[0].stamp_ns if self._fixes else 0, distance_m
@@ -391,7 +386,7 @@ class Localiser:
 
 
 def _engine(config: LocalisationConfig) -> Filter:
-    """Our own filter, or the textbook's, which is imported for the profile that needs it alone."""
+    """The filter; filterpy is imported only for profile `paper`."""
     if config.profile != "paper":
         return FILTERS[config.filter]
     from agents.localisation.filters.textbook import TextbookEkf, TextbookUkf

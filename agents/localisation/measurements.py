@@ -1,9 +1,8 @@
-"""Measurement models z = h(x) of the sensors, with their Jacobians.
+"""Measurement models z = h(x) of the sensors, with Jacobians.
 
-x: the state (`filters.state`): position p, attitude (roll, pitch, yaw), velocity v, angular rate w, acceleration a.
-v, w and a are in `base_link`, R = map_from_base turns them into `map`, r is the lever arm of a sensor in `base_link`,
-and [.]_en are the components east and north. States (m, n) come as rows; where a model takes more than a few operations
-it works on columns, whose values adjoin. Angular rates and forces are turned into `base_link` before they come here.
+x: the state (`filters.state`): position p, attitude (roll, pitch, yaw), velocity v, angular rate w, acceleration a; v,
+w, a in `base_link`. R = map_from_base, r: lever arm in `base_link`, [.]_en: east and north. States (m, n) come as rows;
+larger models work on columns. Rates and forces arrive in `base_link`.
 """
 
 import math
@@ -17,7 +16,7 @@ from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 
-STANDSTILL = "standstill"  # the name that its measurement counts under
+STANDSTILL = "standstill"  # counter name of its measurement
 ROLL, PITCH, YAW = range(ATTITUDE.start, ATTITUDE.stop)
 PLACE = slice(POSITION.start, POSITION.start + 2)
 
@@ -33,10 +32,7 @@ def fix(
     opens: tuple[slice, ...] = (PLACE,),
     change: Change | None = None,
 ) -> Measurement:
-    """A GPS fix (2,): z = [p + R r]_en + e.
-
-    error: states of the receiver's slow error e, None if the filter has none. opens: as of a Measurement.
-    """
+    """A GPS fix (2,): z = [p + R r]_en + e; error: states of the slow error e, or None; opens: as in Measurement."""
 
     def h(x: Floats) -> Floats:
         columns = x.T
@@ -58,7 +54,7 @@ def fix(
 
 
 def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_m: Floats, gate: float) -> Measurement:
-    """Velocity (2,) of an antenna in `map`: z = [R (v + w x r)]_en."""
+    """Antenna velocity (2,) in `map`: z = [R (v + w x r)]_en."""
     by_rate = -_matrix(lever_m)  # w x r = -[r]x w
 
     def h(x: Floats) -> Floats:
@@ -78,13 +74,9 @@ def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_
 def inertial(
     stamp_ns: int, sensor: str, z: Floats, R: Floats, lever_m: Floats, bias: int | None, gate: float
 ) -> Measurement:
-    """Angular rate and specific force (6,) of an IMU: z = (w + b e_z, f).
+    """Angular rate and specific force (6,) of an IMU: z = (w + b e_z, f); bias: state of the yaw gyro's b, or None.
 
-    An accelerometer on a rigid body measures the acceleration of its place less that of gravity, in the body's axes:
-
-        f = a + w x (v + w x r) + g R^T e_z,    R^T e_z = (-sin pitch, cos pitch sin roll, cos pitch cos roll)
-
-    bias: state of the yaw gyro's bias b, None if the filter has none.
+    f = a + w x (v + w x r) + g R^T e_z,    R^T e_z = (-sin pitch, cos pitch sin roll, cos pitch cos roll)
     """
     by_rate = -_matrix(lever_m)  # w x r = -[r]x w
 
@@ -131,10 +123,9 @@ def wheels(
     offset_m: float = 0.0,
     considers: tuple[int, ...] = (),
 ) -> Measurement:
-    """Velocity (3,) by wheels at y to the left of the axle's middle: z = ((1 + s) (v_x - w_z y), v_y, v_z).
+    """Velocity (3,) by wheels at y left of the axle's middle: z = ((1 + s) (v_x - w_z y), v_y, v_z).
 
-    None sideways and upwards at `base_link`. offset_m: y, of several wheels the mean. scale: state of the wheels' scale
-    s, None if the filter has none.
+    v_y = v_z = 0. offset_m: (mean) y. scale: state of the wheel scale s, or None.
     """
 
     def h(x: Floats) -> Floats:
@@ -157,23 +148,20 @@ def wheels(
 
 
 def sides(stamp_ns: int, considers: tuple[int, ...], tuning: LocalisationTuning = TUNING) -> Measurement:
-    """A machine whose wheels say nothing still moves along its own axis: 0 = (v_y, v_z) at `base_link`."""
+    """Without wheel readings a machine still moves along its axis: 0 = (v_y, v_z) at `base_link`."""
     states, R = slice(VELOCITY.start + 1, VELOCITY.stop), tuning.side_mps**2 * EYE[:2, :2]
     return _nothing("sides", stamp_ns, states, R, tuning.gate_sigma, considers)
 
 
 def rest(stamp_ns: int, tuning: LocalisationTuning = TUNING) -> Measurement:
-    """No rotation of a machine that stands as far as GPS shows: 0 = w. It may creep round a bend: the gate is close."""
+    """No rotation while GPS shows standstill: 0 = w; gated closely, as a machine may creep round a bend."""
     return _nothing(STANDSTILL, stamp_ns, RATE, tuning.rate_radps**2 * EYE, tuning.rest_sigma)
 
 
 def turn(
     stamp_ns: int, sensor: str, rate_radps: float, std_radps: float, error: int | None, per_error: float, gate: float
 ) -> Measurement:
-    """Turn rate (1,) about the vertical of `base_link`: z = w_z + per_error e.
-
-    error: state of its lasting error e, None if the filter has none.
-    """
+    """Turn rate (1,) about the vertical of `base_link`: z = w_z + per_error e; error: state of e, or None."""
 
     def h(x: Floats) -> Floats:
         rate = x[:, YAW_RATE] if error is None else x[:, YAW_RATE] + per_error * x[:, error]
@@ -193,10 +181,7 @@ def turn(
 def heading(
     stamp_ns: int, sensor: str, yaw_rad: float, variance: float, error: int, gate: float, change: Change | None = None
 ) -> Measurement:
-    """Absolute heading (1,) of `base_link` in `map`: z = yaw + e.
-
-    error: state of the reference's error e. A reference that is off for long has changed, not the machine's heading.
-    """
+    """Absolute heading (1,) of `base_link` in `map`: z = yaw + e; error: state of e. A relock widens e alone."""
 
     def h(x: Floats) -> Floats:
         return (x[:, YAW] + x[:, error])[:, None]
@@ -219,10 +204,7 @@ def orientation(
     error: int | None = None,
     change: Change | None = None,
 ) -> Measurement:
-    """Attitude (3,) of `base_link` in `map`: z = (roll, pitch, yaw + e).
-
-    error: state of the error e of the heading's anchor, None if the filter has none.
-    """
+    """Attitude (3,) of `base_link` in `map`: z = (roll, pitch, yaw + e); error: state of the anchor's e, or None."""
 
     def h(x: Floats) -> Floats:
         if error is None:
@@ -247,9 +229,9 @@ def rotation(stamp_ns: int, sensor: str, rates_radps: Floats, R: Floats, gate: f
 
 
 def standstill(stamp_ns: int, tuning: LocalisationTuning = TUNING) -> Measurement:
-    """A machine at rest (zero velocity update), which shows the bias of gyros: 0 = (v, w).
+    """Zero velocity update, which shows gyro biases: 0 = (v, w).
 
-    Gated without relocking: an articulated machine turns its rear frame as it steers, also while its wheels stand.
+    Never relocks: an articulated machine turns its rear frame by steering, also at standstill.
     """
     R = np.diag([tuning.still_mps**2] * 3 + [(0.1 * tuning.rate_radps) ** 2] * 3)
     return _nothing(STANDSTILL, stamp_ns, slice(VELOCITY.start, RATE.stop), R, tuning.gate_sigma)
@@ -258,14 +240,13 @@ def standstill(stamp_ns: int, tuning: LocalisationTuning = TUNING) -> Measuremen
 def _nothing(
     sensor: str, stamp_ns: int, states: slice, R: Floats, gate: float, considers: tuple[int, ...] = ()
 ) -> Measurement:
-    """No motion in some states: an assumption, which no sensor measures, so it never relocks."""
+    """No motion in some states: an assumption, so it never relocks."""
     h, jacobian = _picked(states)
     z = np.zeros(len(R))
     return Measurement(sensor, stamp_ns, z, R, h, jacobian, gate_sigma=gate, relocks=False, considers=considers)
 
 
 def _picked(states: slice) -> tuple[Model, Model]:
-    """H and Jacobian of a measurement of some states as they are."""
     return lambda x: x[:, states], lambda x: np.eye(len(x))[states]
 
 
@@ -273,10 +254,7 @@ def _picked(states: slice) -> tuple[Model, Model]:
 
 
 def _turned(columns: Floats, arm: Floats) -> Floats:
-    """East and north (2, m) of a vector (3,), or one each (3, m), of `base_link`, for states (n, m).
-
-    The first two rows of Rz(yaw) Ry(pitch) Rx(roll) arm.
-    """
+    """East and north (2, m) of a vector (3,) or (3, m), for states (n, m): rows of Rz(yaw) Ry(pitch) Rx(roll) arm."""
     attitude = columns[ATTITUDE]
     (sr, sp, sy), (cr, cp, cy) = np.sin(attitude), np.cos(attitude)
     ahead, left, up = arm
@@ -287,6 +265,6 @@ def _turned(columns: Floats, arm: Floats) -> Floats:
 
 
 def _matrix(v: Floats) -> Floats:
-    """[v]x, so that [v]x u is the cross product of v and u."""
+    """[v]x: [v]x u is the cross product of v and u."""
     x, y, z = v.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,14 +1,12 @@
-"""IMUs, wheels, and what else shows the turn: from filter steps to measurements of the body's motion.
+"""IMUs, wheels and turn sensors: filter steps to measurements of body motion.
 
-Driven wheels turn further than the machine moves, by a share that grows with traction.
+Driven wheels turn further than the machine moves, in proportion to traction:
 
     slip = traction (s0 + s1 rolling)        machine speed = wheel speed (1 - slip sign(speed))
 
-traction: drive force over weight, signed ahead. rolling: the part of it that neither climbs nor accelerates, which an
-accelerometer ahead measures together. s0, s1: `slip` and `slip_soft` of the tyres; soft ground resists, and gives way.
-
-A load that nobody weighs makes the traction, and so the slip, seem larger than it is. A machine takes one up as it
-stands.
+traction: drive force over weight, signed ahead. rolling: its part that neither climbs nor accelerates, by an
+accelerometer ahead. s0, s1: `slip`, `slip_soft` of the tyres; soft ground resists and yields. An unweighed load makes
+traction and slip seem larger.
 """
 
 import math
@@ -27,16 +25,15 @@ from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig, SensorConfig
 from protocol.units import GRAVITY_MPS2
 
-STANDSTILL_S = 1.0  # after so long without travel the machine stands; coarse ticks of one that crawls come sooner
-REST_S = 2.0  # and so long without a speed over ground, of which there may be one a second
+STANDSTILL_S = 1.0  # time without travel that is standstill; slow ticks come sooner
+REST_S = 2.0  # the same without speeds over ground, about one a second
 
 
 class MotionSensors:
-    """The motion sensors of one machine.
+    """One machine's motion sensors.
 
-    step_s: length of a filter step. tyres: their `slip` and `slip_soft`. on_plane: whether the filter takes the machine
-    to be on a plane. There an IMU measures the turn alone: tilt and what changes it are no states. is_weighed: whether
-    the load is known. slip_std: of the slip per traction, by the newest step.
+    step_s: of a filter step. tyres: `slip`, `slip_soft`. on_plane: tilt is no state, so an IMU measures the turn only.
+    is_weighed: the load is known. slip_std: of slip per traction, newest step.
     """
 
     def __init__(
@@ -59,7 +56,7 @@ class MotionSensors:
         self._imus = {s.name: s for s in used if s.kind == "imu"}
         self._whole = {s.name: self._whole_imu(i, s) for i, s in enumerate(self._imus.values())}
         self._wheels = [s for s in used if s.kind in ("encoder", "odometry") and s.provides("speed")]
-        # They slip together, so the mean of several is as unsure as the least sure of them.
+        # They slip together: the mean is as uncertain as the worst.
         forward_std = max((s.std.get("speed", tuning.speed_mps) for s in self._wheels), default=0.0)
         self._wheels_R = np.diag([forward_std**2, tuning.side_mps**2, tuning.side_mps**2])
         self._wheels_gate = max((s.gate(tuning.gate_sigma) for s in self._wheels), default=0.0)
@@ -68,16 +65,16 @@ class MotionSensors:
 
     @property
     def turn_error_radps(self) -> float:
-        """Standard deviation of the lasting error of the turn, 0 where IMUs measure it or nothing does."""
+        """Deviation of the lasting turn error; 0 if IMUs or nothing measure the turn."""
         source = self._turn_sensor
         return self._turn_std(source) if source and source.kind != "imu" else 0.0
 
     def forces(self, step: FilterStep) -> list[Floats]:
-        """Specific forces (3,) of the IMUs that measure them."""
+        """Specific forces (3,) of IMUs that measure them."""
         return [mean.force_mps2 for name, mean in step.imu_means.items() if self._imus[name].provides("force")]
 
     def inertial(self, step: FilterStep) -> list[Measurement]:
-        """One measurement per IMU with readings in the step, of those that measure anything of the state."""
+        """A measurement per IMU with usable readings in the step."""
         means = step.imu_means
         if self._on_plane:
             imus = [(i, s) for i, s in enumerate(self._imus.values()) if s.name in means and s.provides("rate")]
@@ -86,7 +83,7 @@ class MotionSensors:
         return [m.at(step.stamp_ns, np.concatenate([mean.rates_radps, mean.force_mps2])) for m, mean in present]
 
     def turn(self, step: FilterStep) -> list[Measurement]:
-        """The turn rate where no IMU measures it. Where nothing does, it shows in fixes alone and is very unsure."""
+        """The turn rate where no IMU measures it; without any sensor, fixes alone show it, poorly."""
         source, layout = self._turn_sensor, self._layout
         if source is None:
             self.counters["turn_unknown"] += 1
@@ -99,11 +96,10 @@ class MotionSensors:
         return [measurements.turn(step.stamp_ns, "turn", rate, std, error, per_error, gate)]
 
     def _steered_std(self, source: SensorConfig, turn: Turn, dt_s: float) -> float:
-        """Standard deviation of a rate by steering, dt_s after the one before: white noise, and the angle's error.
+        """Standard deviation of a steered rate, dt_s after the last: white noise, and the angle's error.
 
-        That is e v / (L cos^2 angle), v the speed, L the wheelbase, and stays for steered_s: a coarse angle is wrong
-        by the same for as long as the driver holds it. White noise as strong in the long run has 2 steered_s / dt times
-        its variance.
+        The latter is e v / (L cos^2 angle), v the speed, L the wheelbase, and lasts steered_s. Equivalent white noise
+        has 2 steered_s / dt times its variance.
         """
         speed = turn.per_error
         tangent = self._wheelbase_m * turn.rate_radps / speed if speed else 0.0
@@ -111,9 +107,9 @@ class MotionSensors:
         return math.hypot(self._tuning.rate_radps, std * math.sqrt(max(2 * self._tuning.steered_s / dt_s, 1.0)))
 
     def wheels(self, step: FilterStep, considers: tuple[int, ...] = ()) -> list[Measurement]:
-        """Speed of the wheels less their slip, and a standstill. Silent ones leave what holds without them.
+        """Wheel speed less slip, and standstill; if silent, what holds without wheels.
 
-        considers: states that the speed leaves as they are; a standstill does not jitter, and teaches them.
+        considers: states that the speed leaves unchanged; a standstill updates them.
         """
         if step.silent:
             still = [measurements.rest(step.stamp_ns, self._tuning)] if step.still_s >= REST_S else []
@@ -137,12 +133,11 @@ class MotionSensors:
         return [rolled, measurements.standstill(step.stamp_ns, self._tuning)]
 
     def _doubt_load(self, still_s: float) -> None:
-        """Doubt the slip from the first stop on at which the machine may have loaded."""
         if still_s >= LOADING_S:
             self._load_doubt = self._tuning.load_doubt
 
     def _whole_imu(self, index: int, sensor: SensorConfig) -> Measurement:
-        """A measurement of an IMU, of which only stamp and value are to be set."""
+        """An IMU's measurement, but for stamp and value."""
         rate_std = self._gyro_std(sensor) if sensor.provides("rate") else UNKNOWN_STD
         force_std = sensor.std.get("force", self._tuning.force_mps2) if sensor.provides("force") else UNKNOWN_STD
         R, lever = np.diag([rate_std**2] * 3 + [force_std**2] * 3), np.array(sensor.mount.xyz_m)
@@ -154,22 +149,21 @@ class MotionSensors:
         return measurements.turn(step.stamp_ns, sensor.name, rate, self._gyro_std(sensor), self._bias(index), 1.0, gate)
 
     def _bias(self, index: int) -> int | None:
-        """State of a yaw gyro's bias."""
         return self._layout.gyro_bias(index) if self._layout.imus else None
 
     def _gyro_std(self, imu: SensorConfig) -> float:
         return imu.std.get("rate", self._tuning.rate_radps)
 
     def _turn_std(self, source: SensorConfig) -> float:
-        """Standard deviation of the rate of odometry, and of what lasts of its error; of steering only the latter."""
+        """Deviation of odometry's rate and lasting error; of steering, the latter."""
         return source.std.get("rate", self._tuning.turn_radps)
 
 
 def shows_tilt(machine: MachineConfig, profile: str) -> bool:
-    """Whether the sensors show roll and pitch; a machine without is taken to be on a plane.
+    """Whether the sensors show roll and pitch; else the machine counts as on a plane.
 
-    By a reference of attitude that the profile uses, else by the direction of gravity between rates of turn. Rates
-    alone show how the tilt changes, and nothing ever corrects it; a force alone is the tilt's or the acceleration's.
+    By an attitude reference that the profile uses, or by gravity between turn rates. Rates alone show only changes of
+    tilt, never corrected; a force alone mixes tilt and acceleration.
     """
     used = [s for s in machine.sensors if s.use]
     bends = any(s.kind == "articulation" for s in used)
@@ -183,14 +177,11 @@ def shows_tilt(machine: MachineConfig, profile: str) -> bool:
 
 
 def rolling_resistance(before: float, traction: float, force_ahead_mps2: float, share: float) -> float:
-    """Rolling resistance over weight [-], low-passed from the one before with the share of a new value.
-
-    force_ahead_mps2: of the accelerometer.
-    """
+    """Rolling resistance over weight [-], low-passed; force_ahead_mps2: by the accelerometer."""
     rolling = abs(traction - force_ahead_mps2 / GRAVITY_MPS2)
     return before + share * (rolling - before)
 
 
 def machine_speed(wheel_mps: float, traction: float, slip_per_traction: float) -> float:
-    """Speed of a machine [m/s] from that of its wheels."""
+    """Machine speed [m/s] from wheel speed."""
     return wheel_mps * (1 - traction * slip_per_traction * math.copysign(1.0, wheel_mps))

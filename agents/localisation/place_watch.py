@@ -1,9 +1,8 @@
-"""A place that jumps while the wheels run on: until it is clear whether it was wrong before or is wrong since.
+"""Which place is right, before or after a jump while the wheels run on.
 
-A receiver that is switched, led astray, or comes out of a tunnel jumps, and may jump back; one that was off all along
-jumps to the right place. The filter has to follow either. Where fixes come back the place before the jump was right,
-and what lies between is not. Where they stay three times as long as they stood for the place before, within bounds,
-they are right, and what lies before is not known to be. Nobody can tell an error that lasts longer from the truth.
+A receiver that is switched, spoofed or leaves a tunnel jumps, and may jump back; one always off jumps to the right
+place. If fixes return, the place before was right and those between wrong. If they stay three times as long as they had
+stood before, within bounds, they are right and earlier places doubtful. Longer errors look like truth.
 """
 
 from collections import Counter
@@ -13,28 +12,28 @@ import numpy as np
 
 from protocol.arrays import Floats
 
-JUMP_M = 8.0  # a shorter one is an error that a receiver may have
-CLEAR_S, MOST_CLEAR_S = 60.0, 600.0  # echoes and switched receivers last for less than both; and a map has to go on
-TIMES = 3.0  # as long as for the place before: as long is a toss-up
-OUTAGE_S = 10.0  # without fixes: dead reckoning alone stands for the place then, and drifts
-MARGIN_NS = 3 * 10**9  # around a jump: it creeps before the filter refuses it, and the filter settles behind it
-BACK = 0.25  # of the jump: what is nearer to the place before has come back
+JUMP_M = 8.0  # smallest jump beyond usual receiver errors
+CLEAR_S, MOST_CLEAR_S = 60.0, 600.0  # time to clear: longer than echoes and receiver switches, yet bounded for the map
+TIMES = 3.0  # over the time for the place before; equal would be a toss-up
+OUTAGE_S = 10.0  # time without fixes, after which drifting dead reckoning stands alone
+MARGIN_NS = 3 * 10**9  # around a jump: it creeps at first, and settles later
+BACK = 0.25  # share of the jump that counts as returned
 
 
 @dataclass
 class PlaceWatch:
-    """Whether the place is clear. counters: of jumps. problem: a sentence by receiver, while it is not."""
+    """Whether the position is clear. counters: of jumps. problem: a sentence by receiver while it is not."""
 
     counters: Counter[str] = field(default_factory=Counter)
     problem: dict[str, str] = field(default_factory=dict)
     _since_ns: int = 0
-    _newest_ns: int = 0  # of the last jump
-    _taken_ns: int = 0  # of the last fix that the filter took
-    _stood_s: float = 0.0  # so long fixes have stood for the place as it is
-    _needed_s: float = 0.0  # and so long they have to, after a jump
+    _newest_ns: int = 0  # stamp of the last jump
+    _taken_ns: int = 0  # stamp of the last accepted fix
+    _stood_s: float = 0.0  # how long fixes have supported the current place
+    _needed_s: float = 0.0  # required time after a jump
     _off_m: Floats = field(default_factory=lambda: np.zeros(2))  # from the place before the first jump
     _furthest_m: float = 0.0
-    _spans: list[tuple[int, int, float]] = field(default_factory=list)  # from when until when places were off, how far
+    _spans: list[tuple[int, int, float]] = field(default_factory=list)  # begin, end, error of doubtful places
 
     @property
     def is_clear(self) -> bool:
@@ -42,7 +41,7 @@ class PlaceWatch:
         return not self.problem
 
     def jumped(self, receiver: str, since_ns: int, now_ns: int, off_m: Floats) -> None:
-        """Note that the filter gave in to fixes of a receiver that were off by so much (2,) since a time."""
+        """Note a relock on fixes off by off_m (2,) since since_ns."""
         if self.is_clear:
             if np.hypot(*off_m) < JUMP_M:
                 return
@@ -60,7 +59,7 @@ class PlaceWatch:
             self.problem = {receiver: f"jumped {far_m:.0f} m {why}"}
 
     def look(self, now_ns: int) -> None:
-        """Note a fix that the filter took; a place that has lasted is believed."""
+        """Note an accepted fix; a lasting place is believed."""
         passed_s, self._taken_ns = (now_ns - self._taken_ns) * 1e-9, max(now_ns, self._taken_ns)
         if 0 < passed_s < OUTAGE_S:
             self._stood_s += passed_s
@@ -70,7 +69,7 @@ class PlaceWatch:
             self._end(0, self._newest_ns + MARGIN_NS)
 
     def off_m(self, stamp_ns: int) -> float:
-        """How far off the place of a stamp may be, beside what the filter states."""
+        """Possible error of a place, beyond the filter's."""
         if not self.is_clear:
             return self._furthest_m
         return max((far_m for from_ns, to_ns, far_m in self._spans if from_ns <= stamp_ns <= to_ns), default=0.0)

@@ -1,6 +1,6 @@
-"""Fixes that repeat bit for bit while the wheels turn: a receiver that hangs, or a table that holds each value.
+"""Fixes that repeat bit for bit while the wheels turn: a stuck receiver, or a table that holds values.
 
-A measured place has noise, so a repeat is no new one: it counts once. Receivers of parked machines may pin theirs.
+Receivers of parked machines may pin theirs.
 """
 
 from collections import Counter
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 from protocol.machine.readings import Gps
 
-MOVED_M = 0.1  # way since a value came first, from which on it cannot be true any more; a parked machine stays below
-LASTING_NS = 3_000_000_000  # a receiver that repeats itself for so long has a fault
+MOVED_M = 0.1  # distance since a value's first occurrence, after which it is stale
+LASTING_NS = 3_000_000_000  # a repeat this long is a fault
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Latitude and longitude [deg], and stamp and way when they came first."""
+    """Latitude and longitude [deg], with stamp and distance of their first occurrence."""
 
     place_deg: tuple[float, float]
     stamp_ns: int
@@ -31,11 +31,11 @@ class Repeats:
 
     @property
     def lasting(self) -> list[str]:
-        """Names of receivers whose place has been the same for over three seconds while the machine moved."""
+        """Receivers stuck for over three seconds while the machine moved."""
         return [name for name, lasts in self._lasting.items() if lasts]
 
     def is_repeated(self, fix: Gps, distance_m: float) -> bool:
-        """Whether a fix says again what was true before; distance_m: way of the wheels so far."""
+        """Whether a fix is a stale repeat; distance_m: wheel distance so far."""
         place_deg, first = (fix.lat_deg, fix.lon_deg), self._first.get(fix.sensor)
         if first is None or first.place_deg != place_deg:
             self._first[fix.sensor] = _Place(place_deg, fix.stamp_ns, distance_m)

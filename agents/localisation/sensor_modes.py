@@ -1,9 +1,8 @@
 """Differential and relative sensors (Moore & Stouch 2014, robot_localization: `differential`, `relative`).
 
-Differential: two successive values make a rate of change. Relative: the first value stands for what the filter
-believes at that moment, its anchor; later values count from there. In robot_localization the anchor is exact, as the
-start is zero by definition. Here the filter may be unsure of it and learn better later, so where the state has room an
-anchor gets states of its own: how far off the filter was at that moment.
+Differential: two values give a rate. Relative: the first value stands for the belief then, its anchor; later ones count
+from it. In robot_localization the start is zero by definition, so the anchor is exact. Here the belief may improve, so
+an anchor's error has states where there is room.
 """
 
 from abc import ABC, abstractmethod
@@ -15,12 +14,12 @@ from protocol.arrays import Floats
 from protocol.machine.machine_config import RELATIVE, SensorConfig
 from protocol.rotations import wrap_angle
 
-PAIR_S = 1.1  # a mean over more is far from the rate at its middle; a receiver of 1 Hz still makes pairs
+PAIR_S = 1.1  # longest pair; 1 Hz receivers still pair
 
 
 @dataclass(frozen=True)
 class StampedValue:
-    """Values (k,) of a sensor and their variances (k,) at a stamp."""
+    """Sensor values (k,) with variances (k,) at a stamp."""
 
     stamp_ns: int
     values: Floats
@@ -28,9 +27,9 @@ class StampedValue:
 
 
 def rate_between(before: StampedValue, now: StampedValue, *, angles: bool = False) -> StampedValue | None:
-    """Mean rate of change between two values, at the middle of their time, where it is right to second order.
+    """Mean rate between two values, at their middle, where it is right to second order.
 
-    None where they are more than PAIR_S apart, or not in order. angles: the values are angles [rad].
+    None if more than PAIR_S apart or out of order. angles: values in rad.
     """
     dt_s = (now.stamp_ns - before.stamp_ns) * 1e-9
     if not 0 < dt_s <= PAIR_S:
@@ -43,45 +42,45 @@ def rate_between(before: StampedValue, now: StampedValue, *, angles: bool = Fals
 
 
 class Measured(Protocol):
-    """A value of a sensor at a stamp."""
+    """A stamped sensor value."""
 
     @property
     def stamp_ns(self) -> int:
-        """When it was measured."""
+        """Stamp of the measurement."""
 
     @property
     def sensor(self) -> SensorConfig:
-        """What measured it."""
+        """The sensor."""
 
 
 Value = TypeVar("Value", bound=Measured)
 
 
 class ModalSensors(ABC, Generic[Value]):
-    """Sensors whose values become measurements of their own stamps, each in its mode."""
+    """Sensors whose values become measurements at their own stamps, by mode."""
 
     def __init__(self) -> None:
         self._confirmed: set[str] = set()
         self._last: dict[str, StampedValue] = {}  # of differential ones
 
     def needs_anchor(self, value: Value) -> bool:
-        """Whether it is a first value of a relative sensor; one that was refused as too late does not count."""
+        """Whether it is a relative sensor's first accepted value."""
         return value.sensor.mode == RELATIVE and value.sensor.name not in self._confirmed
 
     @abstractmethod
     def anchor(self, value: Value, belief: Belief) -> None:
-        """Let a relative sensor count from this value, and from the belief at its stamp."""
+        """Anchor a relative sensor at this value and belief."""
 
     @abstractmethod
     def measurement(self, value: Value) -> Measurement | None:
-        """What the filter gets of this value; None where a differential sensor has no pair."""
+        """The measurement of this value; None for a differential sensor without a pair."""
 
     def confirm(self, value: Value, _: Conditioned) -> None:
-        """Keep the anchor: the filter had room for a measurement that counts from it."""
+        """Keep the anchor: the filter had room for its measurement."""
         self._confirmed.add(value.sensor.name)
 
     def _rate(self, name: str, now: StampedValue, *, angles: bool = False) -> StampedValue | None:
-        """Rate since the last value of a sensor, which this one becomes; values out of order are dropped."""
+        """Rate since the sensor's last value; out-of-order values are dropped."""
         before = self._last.get(name, now)
         if now.stamp_ns < before.stamp_ns:
             return None

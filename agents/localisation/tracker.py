@@ -1,4 +1,4 @@
-"""The tracker: filters all that a machine senses, from one alignment on."""
+"""The tracker filters everything a machine senses, from one alignment on."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -29,15 +29,15 @@ from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import GpsVelocity
 from protocol.site.site_config import Projection
 
-Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
+Event = FilterStep | Fix | Measurement  # inputs of the filter
 
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """What a tracker is built of.
+    """Parts of a tracker.
 
-    profile: of localisation. tyres: `slip` and `slip_soft`. smoothing_s: lag of the smoother. is_started: whether the
-    start is configured, so that a machine without GPS reckons from there. is_weighed: whether its load is known.
+    profile: of localisation. tyres: `slip`, `slip_soft`. is_started: the start is configured, so a machine without GPS
+    reckons from it. is_weighed: its load is known.
     """
 
     machine: MachineConfig
@@ -52,15 +52,14 @@ class TrackerConfig:
 
     @property
     def slow(self) -> bool:
-        """Whether slow errors of sensors are states."""
+        """Whether slow sensor errors are states."""
         return self.profile == "default"
 
 
 class Tracker:
     """Filters events into beliefs. fusion: None until `start`.
 
-    has_relocked: whether the newest fix of a receiver made the filter accept it again, after too many refusals.
-    lanes: those of all machines, as this one uses them; None for not at all.
+    has_relocked: whether the newest fix relocked its receiver. lanes: of the shared map, or None.
     """
 
     def __init__(self, config: TrackerConfig) -> None:
@@ -89,7 +88,7 @@ class Tracker:
             layout, on_plane, self.receivers.errors, turn_error_radps=turn_error, turns_unseen=unseen, tuning=tuning
         )
         self._doubt: Change | None = None
-        self._placed_ns = 0  # stamp of the newest fix or velocity by GPS that was accepted
+        self._placed_ns = 0  # stamp of the newest accepted GPS fix or velocity
 
     @property
     def counters(self) -> Counter[str]:
@@ -99,29 +98,29 @@ class Tracker:
 
     @property
     def belief(self) -> Belief | None:
-        """The whole state, once it is known."""
+        """The whole state, once known."""
         return self.fusion.belief if self.fusion else None
 
     @property
     def wheel_scale(self) -> float | None:
-        """How much further the wheels turn than the machine moves [-], as believed; None where it is no state."""
+        """Estimated wheel travel over machine travel, less 1; None if it is no state."""
         states = self._model.layout.wheel_scales
         return float(self.belief.x[states.start]) if self.belief and states.stop > states.start else None
 
     def slow_error_m(self, receiver: str) -> Floats:
-        """The believed slow error of a receiver (2,), east and north [m]; zeros where it is no state."""
+        """Estimated slow error of a receiver (2,), east and north [m]; zeros if it is no state."""
         states = self.receivers.error_states(receiver)
         return self.belief.x[states] if self.belief and states else np.zeros(2)
 
     def aid_share(self, cross: Floats) -> float:
-        """How much of a place came from lanes, 0 to 1. cross (2 or more, n): its covariance with the state."""
+        """Share of a position that came from lanes, 0 to 1; cross (2 or more, n): its covariance with the state."""
         layout = self.fusion.model.layout if self.fusion else self._model.layout
         return self.lanes.share(cross[:2, layout.map_offset]) if layout.lanes and self.lanes else 0.0
 
     def doubt(self, off_m: float, off_mps: float) -> float:
-        """Be less sure of place and speed, from the next step on; returns the heading [rad].
+        """Widen position and speed from the next step on; returns the heading [rad].
 
-        What receivers seemed to be off is forgotten: it was the wheels.
+        Apparent receiver errors, which the wheels caused, are forgotten.
         """
         errors, layout = self.receivers.forgotten(), self._model.layout
 
@@ -136,7 +135,7 @@ class Tracker:
         return float(self.belief.x[YAW])
 
     def start(self, engine: Filter, alignment: Alignment, first: FilterStep) -> Belief:
-        """Begin to filter, with the belief at the first step."""
+        """Start filtering with the belief at the first step."""
         layout = self._model.layout
         forces, turn_error, tuning = self._body.forces(first), self._body.turn_error_radps, self._config.tuning
         belief = start_belief(alignment, first, forces, layout, turn_error, tuning)
@@ -151,29 +150,28 @@ class Tracker:
         return self._filter_step(fusion, event) if isinstance(event, FilterStep) else self._place(fusion, event)
 
     def is_accepted(self, fix: Fix) -> bool:
-        """Whether the filter took the newest fix of this receiver."""
+        """Whether the filter accepted this receiver's newest fix."""
         last = self.fusion.last.get(fix.sensor.name) if self.fusion else None
         return last is not None and last.accepted
 
     def off_m(self, fix: Fix) -> Floats:
-        """What the newest fix of this receiver is off (2,), east and north."""
+        """Innovation of this receiver's newest fix (2,), east and north."""
         last = self.fusion.last.get(fix.sensor.name) if self.fusion else None
         return last.innovation if last else np.zeros(2)
 
     def _filter_step(self, fusion: Fusion, event: FilterStep) -> list[Belief]:
         """Beliefs that the machine's motion changed.
 
-        Without GPS, wheels and IMUs teach neither place and heading nor the gyros' bias: they show none of them, but
-        the centripetal w x v is linearised at a speed and a rate that jitter from step to step, which looks like
-        information. Fixes outweigh it; without them it bends the bias by 0.4 degrees per second in ten minutes.
-        Standstills and absolute headings still teach all that correlates with them.
+        Without GPS, wheels and IMUs update neither position, heading nor gyro bias. They show none of these, but the
+        centripetal w x v, linearised at jittering values, looks like information: it bends the bias by 0.4 degrees per
+        second in ten minutes. Standstills and absolute headings still update all that correlates.
         """
         absolute = self._references.measurements(event, fusion.belief)
         errors = self._references.errors
         layout = fusion.model.layout
         unplaced = layout.wheel_scale and event.stamp_ns - self._placed_ns > self._config.tuning.unplaced_s * 1e9
-        reckons = unplaced and bool(self._placed_ns or self._config.is_started)  # else the fix that aligned it comes
-        # Wheels show nothing of their own scale s; but h = (1 + s) v is linearised at a speed that jitters.
+        reckons = unplaced and bool(self._placed_ns or self._config.is_started)  # else the aligning fix is to come
+        # Wheels show nothing of their scale s, but h = (1 + s) v is linearised at a jittering speed.
         considers = tuple(range(layout.wheel_scales.start, layout.wheel_scales.stop))
         if unplaced:
             headed = (YAW, *range(layout.gyro_biases.start, layout.gyro_biases.stop)) if reckons else ()
@@ -193,7 +191,7 @@ class Tracker:
         return beliefs + self._follow_lanes(fusion, event.reckoned)
 
     def _follow_lanes(self, fusion: Fusion, reckoned: DeadReckonedPose) -> list[Belief]:
-        """Beliefs that the lanes of all machines changed, where a window of them has ended."""
+        """Beliefs changed by lanes, at the end of a window."""
         aid = self.lanes
         if aid is None or not aid.is_due(reckoned):
             return []
@@ -207,7 +205,6 @@ class Tracker:
         return beliefs
 
     def _place(self, fusion: Fusion, event: Fix | Measurement) -> list[Belief]:
-        """Beliefs that a fix or a velocity by GPS changed."""
         if isinstance(event, Fix):
             name = event.sensor.name
             before = fusion.counters[f"{name}_relocked"]
@@ -220,7 +217,7 @@ class Tracker:
         return beliefs
 
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
-        """Filter a value whose sensor may count from what is believed at its stamp."""
+        """Filter a value, anchored where needed."""
         if sensors.needs_anchor(value):
             sensors.anchor(value, fusion.at(value.stamp_ns))
         measurement = sensors.measurement(value)
@@ -234,7 +231,7 @@ class Tracker:
 
 
 def layout_of(machine: MachineConfig) -> Layout:
-    """States for the slow errors of a machine's sensors."""
+    """States for slow errors of a machine's sensors."""
     source = turn_source(machine)
     imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
     turns = imus + (source is not None and source.kind != "imu")
@@ -243,10 +240,10 @@ def layout_of(machine: MachineConfig) -> Layout:
 
 
 def gps_velocity(reading: GpsVelocity, sensor: SensorConfig, tuning: LocalisationTuning = TUNING) -> Measurement:
-    """Velocity of the antenna in `map` by Doppler, with the variance that is configured, else with its own.
+    """Doppler velocity of the antenna in `map`; its variance is the configured one, else its own.
 
-    It knows nothing of the slow errors of fixes: carrier frequencies suffer little from what delays the code. So it
-    shows the heading and the scale of the wheels at once, and lasts through errors of the fixes.
+    Code delays hardly affect carrier frequencies, so it lacks the slow errors of fixes and shows heading and wheel
+    scale.
     """
     variances = np.array(velocity_variances(reading, sensor))
     z, lever_m = np.array([reading.velocity_e_mps, reading.velocity_n_mps]), np.array(sensor.mount.xyz_m)

@@ -1,6 +1,6 @@
 """Beliefs, motions, measurements, and changes of a belief.
 
-x: mean (n,), P: covariance (n, n), z: measurement (k,), R: its covariance (k, k). All changes except motions and
+x: mean (n,), P: covariance (n, n), z: measurement (k,), R: its covariance (k, k). Changes other than motions and
 measurements are here, as they map the belief's past too (`smoother`).
 """
 
@@ -36,11 +36,11 @@ Model = Callable[[Floats], Floats]  # of states
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How the state moves over a time step.
+    """A motion over a time step.
 
-    f: states (m, n) after the step, angles not wrapped. jacobian: df/dx (n, n) at a state (n,). Q: noise (n, n).
-    angles: components that are angles [rad]; a filter wraps their mean. at_centre: the mean moves as one state, not as
-    the mean of the belief: under an uncertain heading that mean lies inside an arc of places, where no machine can be.
+    f: states (m, n) after it, angles not wrapped. jacobian: df/dx (n, n) at (n,). Q: noise (n, n). angles: components
+    in rad, whose mean a filter wraps. at_centre: the mean moves as one state: with an uncertain heading, the belief's
+    mean lies inside an arc of places, where no machine can be.
     """
 
     f: Model
@@ -54,11 +54,11 @@ class Motion:
 class Measurement:
     """A sensor value with its model: z = h(x) + noise of covariance R.
 
-    h: predicted measurements (m, k) of states (m, n). jacobian: dh/dx (k, n) at a state (n,). angles: components of z
-    that are angles [rad]. gate_sigma: gate in standard deviations, 0 for none. relocks: accepted after too many
-    refusals; false for assumptions. opens: states, (k,) each, whose variance then grows by the innovation; they share
-    it by their variances. change: applied to the belief first, as when an unknown state gets its first value.
-    considers: states it depends on but does not change (Schmidt-Kalman: Schmidt 1966).
+    h: measurements (m, k) of states (m, n). jacobian: dh/dx (k, n) at (n,). angles: components of z in rad. gate_sigma:
+    gate in standard deviations, 0 for none. relocks: accepted after too many refusals; not so assumptions. opens:
+    states, (k,) each, whose variance then grows by the innovation, which they share by variance. change: applied to the
+    belief first, as a state's first value. considers: states it depends on but does not change (Schmidt-Kalman: Schmidt
+    1966).
     """
 
     sensor: str
@@ -82,10 +82,9 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class Conditioned:
-    """A belief after a measurement, or the unchanged prior.
+    """A belief after a measurement, or the unchanged prior. accepted: which of them.
 
-    innovation: (k,), its covariance: (k, k), nis: normalised innovation squared [-], NaN if not computable. accepted:
-    whether the belief is conditioned.
+    innovation: (k,), its covariance: (k, k), nis: normalised innovation squared [-], NaN if not computable.
     """
 
     belief: Belief
@@ -97,7 +96,7 @@ class Conditioned:
 
 @dataclass(frozen=True)
 class PoseBelief:
-    """Pose in `map`: position [m], heading [rad, in +-pi], speed [m/s], covariance (2, 2) [m2].
+    """Pose in `map`: position [m], heading [rad, in +-pi], speed [m/s], covariance (2, 2).
 
     aid_share: share of the position that came from lanes, 0 to 1.
     """
@@ -112,7 +111,7 @@ class PoseBelief:
 
 
 class DivergedError(ArithmeticError):
-    """The result of a filter is no covariance: it has to start again."""
+    """No covariance came out; the filter must start again."""
 
 
 class Filter(Protocol):
@@ -179,8 +178,8 @@ def open_states(belief: Belief, states: slice, covariance: Floats) -> Belief:
 def restate_states(belief: Belief, states: slice, before: float, after: float) -> Belief:
     """Change the variance of a stationary error.
 
-    An error is a sum of errors that come and go. A growing one gains an independent part. One that shrinks from e, with
-    variances s before and r after, keeps r / s of e: the remaining part has covariance r with e.
+    A growing error gains an independent part. One that shrinks from e, with variances s before and r after, keeps r / s
+    of e, as the remaining part has covariance r with e.
     """
     kept = min(after / before, 1.0)
     x, M = belief.x.copy(), np.eye(len(belief.x))
@@ -192,5 +191,4 @@ def restate_states(belief: Belief, states: slice, before: float, after: float) -
 
 
 def _mapped(belief: Belief, M: Floats) -> Past | None:
-    """The past after a change that maps the state's error by M (n, n)."""
     return belief.past and belief.past.mapped(M)

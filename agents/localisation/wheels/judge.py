@@ -1,8 +1,8 @@
-"""Wheels are judged as receivers are: what they roll against fixes, the turn by gyros and the force ahead.
+"""Judges wheel sensors by what they roll against fixes, gyro turns and force ahead.
 
-NEEDED stretches in a row that contradict a wheel sensor in one way condemn it, unless the IMU sides with it: a receiver
-that wanders beside a parked machine is not felt, nor are clocks that are apart. A sensor whose starts and stops are
-those of the accelerometer the other way round needs no fixes to be judged. One that is right again counts again.
+NEEDED contradicting stretches in a row condemn a sensor, unless the IMU sides with it: it feels neither wandering
+receivers nor clock differences. A sensor whose starts and stops oppose the accelerometer's needs no fixes. One that is
+right again counts again.
 """
 
 import cmath
@@ -20,18 +20,18 @@ from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, GpsVelocity, Imu, Odometry, WheelReading
 from protocol.site.site_config import Projection
 
-NEEDED = 3  # stretches in a row that condemn or acquit; twice as many to condemn without an accelerometer
-UNFELT_MPS, KEPT = 0.4, 0.7  # speed that wheels or force miss of late; how much of it is left after a second
-WEIGHED_S = 0.09  # of force, at least, from one look at the sign to the next: a tenth of what it is compared over
-BEFORE_NS = 3 * 10**9  # how long before a stretch its cause may lie: wheels stop, and the machine drives on
-STOP_NS = 3 * 10**9  # wheels that stop, and are not felt to until then, have died
-STILL_RADPS = 0.04  # above the bias of any gyro: a machine that turns faster does not stand
-TURNED_RAD = 0.15  # since wheels stood: more than a gyro's bias makes of a run
-BACK_M = 0.5  # rolled back: no counter without direction does that
+NEEDED = 3  # stretches in a row to condemn or acquit; double without accelerometer
+UNFELT_MPS, KEPT = 0.4, 0.7  # recent speed that wheels or force miss, and its remainder after a second
+WEIGHED_S = 0.09  # least force integration between sign checks: a tenth of a span
+BEFORE_NS = 3 * 10**9  # lead of a cause: wheels stop, the machine drives on
+STOP_NS = 3 * 10**9  # wheels that stop, not felt within this time, have died
+STILL_RADPS = 0.04  # above any gyro bias: no standstill
+TURNED_RAD = 0.15  # turn since wheels stopped: more than gyro bias in a run
+BACK_M = 0.5  # rolled back: no unsigned counter does that
 
 
 class Fault(Enum):
-    """What is wrong with a wheel sensor, and what to do."""
+    """A wheel sensor's fault, and the remedy."""
 
     DIED = "stopped while the machine drove on: look at its plug, its cable and its gap"
     CARRIED = "stands while the machine moves: it is carried, or the sensor is dead"
@@ -48,9 +48,9 @@ OTHER_WAY = "feels starts and stops the other way round than the wheels: look at
 
 @dataclass(frozen=True)
 class Fall:
-    """A wheel sensor was condemned: how far it has led the place astray [m], how fast [m/s], and which way it faces.
+    """A condemned sensor: its errors of position and speed.
 
-    is_headed: whether the heading that was found with it may be right.
+    is_headed: whether the heading found with it may be right.
     """
 
     off_m: float
@@ -59,11 +59,11 @@ class Fall:
 
 
 class _ForcedSign(TravelSign):
-    """The sign of a wheel sensor's speed; and when speed and force last changed without each other."""
+    """Sign of a wheel speed, and when speed and force last changed independently."""
 
     unfelt_ns = 0
     is_new = False
-    _off_mps = 0.0  # what the force has changed the speed by of late, less what the wheels have
+    _off_mps = 0.0  # recent speed change by force less that by wheels
 
     def _add_span(self, accel_mps2: float, force_mps2: float, dt_s: float) -> None:
         mean_accel, mean_force = self._means or (0.0, force_mps2)
@@ -76,11 +76,10 @@ class _ForcedSign(TravelSign):
 
 @dataclass
 class _Wheel:
-    """A wheel sensor. place_m: where it says the machine is, in the dead-reckoned frame.
+    """A wheel sensor. place_m: its track in the dead-reckoned frame.
 
-    sums: those of the IMU at its newest reading. moved_ns, moved_rad: when it last rolled, and where the machine faced;
-    changed_ns: when it last read another speed. distance_m, rolled_m, back_m: rolled, up in reverse too, down in it,
-    and in reverse alone.
+    sums: IMU integrals then. moved_ns, moved_rad: last roll, and the machine's angle. changed_ns: last new speed.
+    distance_m, rolled_m, back_m: rolled in total, signed, in reverse.
     """
 
     reading: WheelReading
@@ -98,7 +97,7 @@ class _Wheel:
 
 
 class WheelJudge:
-    """Judges the wheel sensors of a machine. faults: of those that do not count. fall: the newest verdict, once."""
+    """Judges a machine's wheel sensors. faults: of excluded ones. fall: the newest verdict, once."""
 
     def __init__(self, machine: MachineConfig, projection: Projection) -> None:
         self.faults: dict[str, Fault] = {}
@@ -109,13 +108,13 @@ class WheelJudge:
         self._other_way = False
         self.fall: Fall | None = None
         self._stretches: dict[tuple[str, str], Stretches] = {}
-        self._pinned: dict[str, tuple[float, float]] = {}  # the last fix of each receiver
+        self._pinned: dict[str, tuple[float, float]] = {}  # last fix of each receiver
         self._sums, self._imu_ns = (0.0, 0.0, 0.0), 0  # integrals of force ahead and pitch rate, and their time
-        self._angle_rad = self._before_rad = 0.0  # turned so far, and until dead reckoning began anew
+        self._angle_rad = self._before_rad = 0.0  # turned so far, and before a restart
         self.forget_times()
 
     def forget_times(self) -> None:
-        """Begin anew with every stamp, as after a pause or where the clock was set; verdicts stay."""
+        """Discard stamps after a pause or clock change; verdicts stay."""
         self._wheels: dict[str, _Wheel] = {}
         self._placed: dict[str, tuple[int, complex]] = {}  # by velocities
         self._turned, self._moves_ns = (0, 0.0), -PAUSE_NS
@@ -123,17 +122,17 @@ class WheelJudge:
             stretches.forget_times()
 
     def restart(self) -> None:
-        """Go on with a dead reckoning that begins anew."""
+        """Continue with a restarted dead reckoning."""
         self._before_rad = self._angle_rad
 
     @property
     def problems(self) -> dict[str, str]:
-        """What is wrong, a sentence by sensor."""
+        """Faults, a sentence by sensor."""
         imu = {self._imu: OTHER_WAY} if self._other_way else {}
         return {name: fault.value for name, fault in self.faults.items()} | imu
 
     def heard(self, readings: list[Sensed], reckoned: DeadReckoning, factor_of: Callable[[str], float]) -> list[Sensed]:
-        """Judge by readings of one stamp before dead reckoning has them; those that count. factor_of: of variances."""
+        """One stamp's readings that count, before dead reckoning; all are judged. factor_of: of variances."""
         self._angle_rad = angle_rad = self._before_rad + reckoned.angle_rad
         for reading, sensor in readings:
             if isinstance(reading, Imu) and reading.sensor == self._imu:
@@ -146,7 +145,7 @@ class WheelJudge:
         return [one for one in readings if one[0].sensor not in self.faults] if self.faults else readings
 
     def _stand(self, now_ns: int, reckoned: DeadReckoning) -> None:
-        """Let a machine that turns, or that fixes see moving, not stand, whatever its wheels say."""
+        """Deny standstill while gyro or fixes see motion."""
         since_ns, angle_rad = self._turned
         if (passed_s := (now_ns - since_ns) * 1e-9) >= PAUSE_S:
             if abs(self._angle_rad - angle_rad) > STILL_RADPS * passed_s:
@@ -156,7 +155,6 @@ class WheelJudge:
             reckoned.show_motion(now_ns)
 
     def _feel(self, imu: Imu) -> None:
-        """Integrate the force ahead and the pitch rate."""
         dt_s, self._imu_ns = (imu.stamp_ns - self._imu_ns) * 1e-9, imu.stamp_ns
         if 0 < dt_s < PAUSE_S:
             (x, y, z), (u, v, w), _ = self._base_from_imu
@@ -166,7 +164,6 @@ class WheelJudge:
             self._sums = force_mps + dt_s * ahead_mps2, pitch_rad - dt_s * nose_down_radps, seconds + dt_s
 
     def _roll(self, now: WheelReading, sensor: SensorConfig, angle_rad: float) -> None:
-        """Move a wheel sensor's own place."""
         name, stamp_ns = now.sensor, now.stamp_ns
         wheel = self._wheels.get(name)
         if wheel is None or abs(stamp_ns - wheel.reading.stamp_ns) > PAUSE_NS:
@@ -189,7 +186,6 @@ class WheelJudge:
         self._weigh_sign(wheel)
 
     def _weigh_sign(self, wheel: _Wheel) -> None:
-        """Compare changes of a wheel sensor's speed with the force ahead."""
         sign, name, now_ns = wheel.sign, wheel.reading.sensor, wheel.reading.stamp_ns
         fault = self.faults.get(name)
         if fault == Fault.UNSIGNED and wheel.back_m > BACK_M:
@@ -213,7 +209,7 @@ class WheelJudge:
                 self._condemn(name, Fault.REVERSED, Fall(0.0, 0.0, is_headed=False))
 
     def _place(self, reading: Gps | GpsVelocity, sensor: SensorConfig, angle_rad: float, worse: float) -> None:
-        """Compare each wheel sensor with a receiver, whose standard deviation is so many times worse than it says."""
+        """Compare wheel sensors with a receiver, whose deviation is `worse` times the stated."""
         now_ns, lever_m = reading.stamp_ns, complex(*sensor.mount.xyz_m[:2])
         fix_m = self._integrated(reading) if isinstance(reading, GpsVelocity) else self._fixed(reading)
         if fix_m is None:
@@ -229,7 +225,7 @@ class WheelJudge:
                 self._note(name, run, now)
 
     def _fixed(self, fix: Gps) -> complex | None:
-        """The place of a fix; None of one that is the last one once more."""
+        """The place; None for a repeat."""
         pinned = fix.lat_deg, fix.lon_deg
         if self._pinned.get(fix.sensor) == pinned:
             return None
@@ -238,7 +234,6 @@ class WheelJudge:
         return complex(x, y)
 
     def _integrated(self, velocity: GpsVelocity) -> complex:
-        """The way of a receiver by its velocities."""
         name, now_ns = velocity.sensor, velocity.stamp_ns
         last_ns, place_m = self._placed.get(name, (now_ns, 0j))
         dt_s = (now_ns - last_ns) * 1e-9
@@ -254,7 +249,6 @@ class WheelJudge:
                 stretches.interrupt()
 
     def _note(self, name: str, run: Run, now: Place) -> None:
-        """Judge a wheel sensor by stretches in a row."""
         wheel, fault, kind = self._wheels[name], self.faults.get(name), run.kind
         if kind == Kind.STANDS:
             self._moves_ns = now.stamp_ns
@@ -270,7 +264,7 @@ class WheelJudge:
             self._condemn(name, _fault(wheel, run, now), Fall(run.off_m, run.off_m / seconds, is_headed=True))
 
     def _is_doubtful(self, wheel: _Wheel, run: Run, now: Place) -> bool:
-        """Whether the IMU contradicts the wheels too, or there is none."""
+        """Whether the IMU contradicts the wheels too, or is missing."""
         turned_rad = abs(now.angle_rad - wheel.moved_rad) if run.kind == Kind.STANDS else 0.0
         return not self._imu or wheel.sign.unfelt_ns > run.begin.stamp_ns - BEFORE_NS or turned_rad > TURNED_RAD
 
@@ -298,7 +292,6 @@ def _repeats(wheel: _Wheel, run: Run) -> bool:
 
 
 def _std_m(reading: Gps | GpsVelocity, sensor: SensorConfig, seconds: float) -> float:
-    """Standard deviation of the way over so long, by a receiver."""
     if isinstance(reading, GpsVelocity):
         return seconds * math.sqrt(sum(velocity_variances(reading, sensor)) / 2)
     return math.sqrt(moved_variance(reading, sensor, seconds))

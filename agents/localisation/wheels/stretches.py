@@ -1,8 +1,8 @@
-"""A wheel sensor beside a receiver: what both say of stretches that are long enough to tell.
+"""Compares a wheel sensor with a receiver over stretches long enough to tell.
 
-A stretch lasts until its way is SURE times as long as the receiver's errors make it unsure. So jumps of fixes fall into
-one stretch, or two, and slow errors matter little. Directions are compared in the frame of dead reckoning, which gyros
-keep for a while: the turn from there into `map` is taken from stretches that agree.
+A stretch ends at SURE times the receiver's error, so jumps of fixes affect one or two, and slow errors little.
+Directions are compared in the dead-reckoned frame, which gyros keep for a while; agreeing stretches give its rotation
+into `map`.
 """
 
 import cmath
@@ -11,18 +11,18 @@ from enum import Enum
 
 from agents.dead_reckoning import MAX_WHEEL_MPS
 
-LEAST_M, LEAST_S, MOST_S = 3.0, 1.0, 15.0  # way, by either, and time of a stretch
-SURE = 4.0  # of a stretch's way, and of what contradicts: least size over the standard deviation of the way by fixes
-NEAR, FAR = 0.3, 0.4  # of the longer way, what both differ by at most if they agree, at least if they contradict
-STANDS = 0.1  # of the way by fixes: wheels that roll less stand
-HALF = 0.625  # ratio of ways, or its inverse, beyond which they differ by more than slip and tyres make
-OPPOSED = 0.5  # cosine of an angle: beyond its negative, directions are opposite
-LEARNS = 0.2  # share of a stretch in the usual ratio
-HEADED_NS = 60 * 10**9  # for so long a gyro keeps a direction to half a radian, even one off by 0.5 degrees per second
+LEAST_M, LEAST_S, MOST_S = 3.0, 1.0, 15.0  # length (by either) and duration
+SURE = 4.0  # least length and contradiction, over the deviation by fixes
+NEAR, FAR = 0.3, 0.4  # difference over the longer length: agrees below, contradicts above
+STANDS = 0.1  # of the length by fixes; wheels below it stand
+HALF = 0.625  # ratio of lengths (or inverse) beyond slip and tyres
+OPPOSED = 0.5  # cosine; below its negative, directions are opposite
+LEARNS = 0.2  # weight of a stretch in the usual ratio
+HEADED_NS = 60 * 10**9  # time a gyro keeps direction to half a radian, with a bias of 0.5 degrees per second
 
 
 class Kind(Enum):
-    """How stretches by a wheel sensor compare with fixes."""
+    """How stretches of a wheel sensor compare with fixes."""
 
     AGREES = "agrees"
     STANDS = "stands"
@@ -34,10 +34,9 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Place:
-    """Where the machine is [m], as complex numbers: by a receiver in `map`, by wheels in the dead-reckoned frame.
+    """The machine's place [m], complex: by a receiver in `map`, by wheels in the dead-reckoned frame.
 
-    distance_m: what the wheels have rolled, up in reverse too; rolled_m: down in reverse. angle_rad: dead-reckoned.
-    lever_m: where the antenna sits, ahead + i left.
+    distance_m, rolled_m: rolled in total, signed. lever_m: antenna, ahead + i left.
     """
 
     stamp_ns: int
@@ -50,16 +49,16 @@ class Place:
 
     @property
     def antenna_m(self) -> complex:
-        """Where the antenna is beside `base_link`, in the dead-reckoned frame."""
+        """Antenna relative to `base_link`, in the dead-reckoned frame."""
         return self.lever_m * cmath.exp(1j * self.angle_rad)
 
 
 @dataclass(frozen=True)
 class Run:
-    """Stretches in a row that agree, or that contradict: how many, and where the first began.
+    """Successive stretches that all agree or all contradict.
 
-    stands: whether the wheels stood in the last one. off_m: how far fixes and wheels are apart, in sum. fixes_m,
-    wheels_m: ways by both, those of wheels in the usual ratio. along_m2: sum of products of ways along each other.
+    stands: wheels stood in the last. off_m: summed difference. fixes_m, wheels_m: lengths, in the usual ratio.
+    along_m2: sum of scalar products.
     """
 
     agrees: bool
@@ -73,7 +72,7 @@ class Run:
 
     @property
     def kind(self) -> Kind:
-        """What they say of the wheels, together."""
+        """Their common verdict on the wheels."""
         if self.agrees:
             return Kind.AGREES
         if self.stands:
@@ -85,28 +84,28 @@ class Run:
 
 
 class Stretches:
-    """Compares one wheel sensor with one receiver. begin: where the stretch begins that lasts."""
+    """Compares one wheel sensor with one receiver. begin: of the current stretch."""
 
     def __init__(self) -> None:
-        self._usual = 0.0  # way by fixes over way by wheels; 0 as long as they never agreed
+        self._usual = 0.0  # length by fixes over length by wheels; 0 before they agreed
         self.forget_times()
 
     def forget_times(self) -> None:
-        """Begin anew with every stamp; the usual ratio is none of the clock's."""
+        """Discard stamps; the usual ratio stays."""
         self.begin: Place | None = None
         self.agreed_ns = 0
         self._run: Run | None = None
-        self._last_m, self._ended_ns = 0j, 0  # of the newest stretch
-        self._turn = 0j  # from the dead-reckoned frame into `map`, of length 1
+        self._last_m, self._ended_ns = 0j, 0
+        self._turn = 0j  # unit rotation from the dead-reckoned frame into `map`
 
     def interrupt(self) -> None:
-        """Begin anew with the next place: nobody knows what happened meanwhile."""
+        """Restart at the next place, after an unknown motion."""
         self.begin, self._turn = None, 0j
 
     def add(self, now: Place, std_m: float) -> Run | None:
-        """Take in a place; returns the run that a stretch which ends here makes longer.
+        """Add a place; returns the run extended by a stretch that ends here, once it shows agreement.
 
-        std_m: of the way by fixes since the stretch began. A stretch ends where it shows whether both agree.
+        std_m: deviation by fixes since its begin.
         """
         if (begin := self.begin) is None:
             self.begin = now
@@ -129,7 +128,7 @@ class Stretches:
         return self._continue(begin, now, by_fixes, off_m, agrees=agrees)
 
     def _off_m(self, by_fixes: complex, by_wheels: complex, now_ns: int) -> float:
-        """How far both are apart; of wheels whose unit is not known yet only whether they stand."""
+        """Difference of both; before the unit is known only whether wheels stand."""
         if self._is_headed(now_ns):
             return abs(by_fixes - self._usual * self._turn * by_wheels)
         return abs(abs(by_fixes) - (self._usual or 1.0) * abs(by_wheels))
@@ -138,7 +137,7 @@ class Stretches:
         return bool(self._turn) and now_ns - self.agreed_ns < HEADED_NS
 
     def _learn(self, by_fixes: complex, by_wheels: complex, now_ns: int) -> None:
-        """Learn the direction, and the usual ratio along it: noise makes each way by fixes longer."""
+        """Learn direction, and ratio along it, since noise lengthens displacements by fixes."""
         turn = by_fixes / by_wheels
         headed = self._turn + turn / abs(turn) if self._is_headed(now_ns) else turn
         self._turn, self.agreed_ns = headed / abs(headed), now_ns
@@ -146,7 +145,6 @@ class Stretches:
         self._usual += LEARNS * (ratio - self._usual) if self._usual else ratio
 
     def _continue(self, begin: Place, now: Place, by_fixes: complex, off_m: float, *, agrees: bool) -> Run:
-        """The run with one more stretch; fixes that jump to and fro are no way that a machine goes."""
         by_wheels, run, unit = now.wheel_m - begin.wheel_m, self._run, self._usual or 1.0
         goes_back = (by_fixes * self._last_m.conjugate()).real < 0
         lasts = run is not None and (begin.stamp_ns - self._ended_ns) * 1e-9 < MOST_S

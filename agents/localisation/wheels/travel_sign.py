@@ -1,45 +1,44 @@
-"""Which way a machine moves: changes of its speed against the force that an accelerometer ahead measures.
+"""Direction of travel: changes of speed against the accelerometer's force ahead.
 
-Over spans of about a second, with a the mean acceleration by the speed and f the mean specific force ahead less what
-the gyro says the tilt has changed of it, both less their means of late,
+Over spans of a second, a: mean acceleration by speed, f: mean specific force ahead less the gyro's tilt change, both
+less recent means, which hold slope and bias:
 
-    a = k f + noise        k = 1, or -1 where the speed has the wrong sign
+    a = k f + noise        k = 1, or -1 if the speed has the wrong sign
 
-The means of late are the slope under the machine and the accelerometer's bias, which last. The regression forgets, so
-it shows the sign of late; at a steady speed it shows nothing.
+The regression forgets; steady speed shows nothing.
 """
 
 import math
 
 from protocol.units import GRAVITY_MPS2
 
-SPAN_S = 1.0  # shorter ones show the noise of a speed, longer ones smooth starts and stops away
-MAX_SPAN_S = 2.5  # speeds that are further apart do not show how the acceleration changes
-TILT_S = 5.0  # how long the gyro's tilt is remembered: a bias of half a degree per second makes 2.5 degrees of it
-MEAN_S = 10.0  # and slope and bias
-MEMORY_S = 60.0  # of the regression: a machine starts or stops within it
-GAINS = 0.5, 2.0  # of the regression, at either sign: slopes that come and go make it smaller
-MIN_SIGMA = 4.0  # the gain over its standard deviation
-MIN_SPANS = 2.0  # one shock decides nothing
-NOISE_MPS2, NOISE_SPANS = 0.2, 4.0  # of the acceleration at first: Doppler of 0.14 m/s; it counts as so many spans
+SPAN_S = 1.0  # shorter spans show noise, longer ones hide starts and stops
+MAX_SPAN_S = 2.5  # longest span that shows acceleration
+TILT_S = 5.0  # memory of tilt: a bias of 0.5 degrees per second adds 2.5 degrees
+MEAN_S = 10.0  # memory of slope and bias
+MEMORY_S = 60.0  # memory of the regression: machines start or stop within it
+GAINS = 0.5, 2.0  # bounds of its gain; changing slopes reduce it
+MIN_SIGMA = 4.0  # gain over its standard deviation
+MIN_SPANS = 2.0  # a single shock decides nothing
+NOISE_MPS2, NOISE_SPANS = 0.2, 4.0  # prior noise, a Doppler of 0.14 m/s, and its weight in spans
 
 
 class TravelSign:
-    """The sign of one source of speed; forces and speeds come in the order of their stamps."""
+    """The sign of one speed source; input in stamp order."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Start again, as where the sign may be another one."""
+        """Restart, as the sign may have changed."""
         self._tilt_rad = 0.0
-        self._force_mps, self._force_s = 0.0, 0.0  # integral of the force since the span began, and over how long
-        self._last: tuple[int, float] | None = None  # stamp and speed at the span's begin
+        self._force_mps, self._force_s = 0.0, 0.0  # integral of force over the span, and its time
+        self._last: tuple[int, float] | None = None  # at the span's begin
         self._means: tuple[float, float] | None = None  # of acceleration and force
         self._count = self._aa = self._af = self._ff = 0.0
 
     def add_force(self, ahead_mps2: float, nose_up_radps: float, dt_s: float) -> None:
-        """Add the mean specific force ahead, gravity's share included, and the mean pitch rate, over dt_s."""
+        """Add mean specific force ahead, with gravity, and mean pitch rate over dt_s."""
         if not 0 < dt_s <= MAX_SPAN_S:  # a pause
             self._tilt_rad, self._last = 0.0, None
             return
@@ -48,7 +47,7 @@ class TravelSign:
         self._force_s += dt_s
 
     def add_speed(self, stamp_ns: int, speed_mps: float) -> None:
-        """Add a speed, whose sign is in question."""
+        """Add a speed of unknown sign."""
         since_s = (stamp_ns - self._last[0]) * 1e-9 if self._last else math.inf
         if 0 <= since_s < 0.95 * SPAN_S:
             return
@@ -67,7 +66,7 @@ class TravelSign:
 
     @property
     def sign(self) -> int:
-        """1 where the speed has the sign of the motion, -1 where it has the other one, 0 where nothing shows it."""
+        """1 if the speed has the sign of the motion, -1 if the other, 0 if unknown."""
         if self._count <= MIN_SPANS or not self._ff:
             return 0
         gain = self._af / self._ff
