@@ -1,4 +1,4 @@
-"""Readings of made-up drives with known physics, and recorded ones of the simulator, for the tests of the agents."""
+"""Readings of synthetic drives with known physics and of simulated ones, for tests of the agents."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sim.simulator import Simulator
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 PROJECTION = Projection(SITE)
-START = (10.0, 20.0, 0.7)  # where drives start
+START = (10.0, 20.0, 0.7)  # where drives start: east, north [m], heading [rad]
 START_NS = 1_767_225_600_000_000_000
 TRUE_STEP_S = 0.01
 LEVER_M = (0.8, 0.3, 3.0)
@@ -54,7 +54,7 @@ def changed_sensor(vehicle: MachineConfig, name: str, **options: Any) -> Machine
 
 @dataclass(frozen=True)
 class Leg:
-    """So many seconds of constant acceleration and turn rate, with a load, bent by an angle to the left."""
+    """Seconds of constant acceleration and turn rate, loaded, articulated to the left."""
 
     seconds: float
     accel_mps2: float = 0.0
@@ -65,9 +65,9 @@ class Leg:
 
 @dataclass(frozen=True)
 class Ground:
-    """Rolling resistance of a plane, and its slope angles ahead and to the left of the machine as it starts.
+    """Rolling resistance and slope angles of a plane, ahead and left of the starting machine, positive uphill.
 
-    Positive uphill. A machine that turns on the plane takes the slope from another side.
+    A turn on the plane changes the machine's slopes.
     """
 
     c_rr: float = 0.04
@@ -75,14 +75,14 @@ class Ground:
     left_rad: float = 0.0
 
     def turned(self, by_rad: float) -> Ground:
-        """As a machine has it that turned left on the plane."""
+        """After a turn to the left."""
         c, s, ahead, left = math.cos(by_rad), math.sin(by_rad), math.sin(self.ahead_rad), math.sin(self.left_rad)
         return replace(self, ahead_rad=math.asin(c * ahead + s * left), left_rad=math.asin(c * left - s * ahead))
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What was true, at 100 Hz, and the sensors' readings without any noise."""
+    """Truth at 100 Hz and noise-free readings."""
 
     stamps_ns: list[int]
     x_m: Floats
@@ -96,12 +96,12 @@ class Drive:
         return float(self.x_m[i]), float(self.y_m[i]), float(self.heading_rad[i])
 
     def off_m(self, located: PoseBelief | Belief) -> float:
-        """How far off a pose lies."""
+        """Position error."""
         x, y = located.x[:2] if isinstance(located, Belief) else (located.x_m, located.y_m)
         return math.dist((x, y), self.at(located.stamp_ns)[:2])
 
     def turned_rad(self, located: PoseBelief | Belief) -> float:
-        """How far off its heading is."""
+        """Heading error."""
         heading = float(located.x[YAW]) if isinstance(located, Belief) else located.heading_rad
         return abs(math.remainder(heading - self.at(located.stamp_ns)[2], math.tau))
 
@@ -114,11 +114,11 @@ def drive(
     heading_rad: float = 0.7,
     without: Sequence[str] = (),
 ) -> Drive:
-    """Drive from (10, 20) at rest; gyro, force and torque at 100 Hz, wheels at 20 Hz, fixes at 5 Hz."""
+    """Drive from (10, 20) at rest: gyro, force, torque 100 Hz, wheels 20 Hz, fixes 5 Hz."""
     return _drive(tuple(legs), vehicle, ground or Ground(), heading_rad, tuple(without))
 
 
-@lru_cache(maxsize=32)  # many tests share a drive
+@lru_cache(maxsize=32)  # shared by many tests
 def _drive(
     legs: tuple[Leg, ...], vehicle: MachineConfig, ground: Ground, heading_rad: float, without: tuple[str, ...]
 ) -> Drive:
@@ -170,9 +170,9 @@ def _readings(
 
 
 def drive_n(vehicle: MachineConfig, ground: Ground, leg: Leg, v: float) -> float:
-    """Drive force that balances inertia, the wheels' inertia, the slope and the rolling resistance.
+    """Drive force balancing inertia, wheel inertia, slope and rolling resistance.
 
-    A bent machine climbs with its front axle's share of the weight in another direction.
+    An articulated machine's front axle climbs in another direction, with its share of the weight.
     """
     mass = vehicle.mass_kg + leg.payload_kg
     rolling = ground.c_rr * math.cos(ground.ahead_rad) * float(np.sign(v))
@@ -185,7 +185,7 @@ def drive_n(vehicle: MachineConfig, ground: Ground, leg: Leg, v: float) -> float
 
 
 def _imu(sensor: SensorConfig, vehicle: MachineConfig, ground: Ground, leg: Leg, v: float, stamp_ns: int) -> Imu:
-    """At its place on a body that sits on tyres."""
+    """On a body sitting on tyres."""
     up = GRAVITY_MPS2 * math.sqrt(1 - math.sin(ground.ahead_rad) ** 2 - math.sin(ground.left_rad) ** 2)
     ahead = leg.accel_mps2 + GRAVITY_MPS2 * math.sin(ground.ahead_rad)
     left = v * leg.turn_radps + GRAVITY_MPS2 * math.sin(ground.left_rad)
@@ -205,7 +205,7 @@ def fix(sensor: SensorConfig, stamp_ns: int, x: float, y: float, heading: float,
 
 
 def noisy(readings: Iterable[Reading], seed: int, *, torque: float = 1.0, force_mps2: float = 0.0) -> list[Reading]:
-    """Readings as bad sensors have them: torque times a scale, a zero of the accelerometer ahead, white noise."""
+    """Poor sensors: torque scale, accelerometer zero ahead, white noise."""
     rng = np.random.default_rng(seed)
     noised: list[Reading] = []
     for r in readings:
@@ -232,7 +232,7 @@ def noisy(readings: Iterable[Reading], seed: int, *, torque: float = 1.0, force_
 def moved(
     readings: Iterable[Reading], north_m: float, *sensors: str, from_s: float = 0.0, to_s: float = math.inf
 ) -> list[Reading]:
-    """Fixes of these receivers lie further north from a time on, until another."""
+    """Shift these receivers' fixes north for a time."""
 
     def is_moved(r: Reading) -> bool:
         return r.sensor in (sensors or ("gps-1",)) and after(r, from_s) and not after(r, to_s)
@@ -243,12 +243,12 @@ def moved(
 
 
 def biased(readings: Iterable[Reading], radps: float) -> list[Reading]:
-    """Gyros are off about the vertical."""
+    """Add a vertical gyro bias."""
     return [replace(r, gyro_z_radps=r.gyro_z_radps + radps) if isinstance(r, Imu) else r for r in readings]
 
 
 def thinned(readings: Iterable[Reading], every_ms: int = 50) -> list[Reading]:
-    """Fewer of the fast readings, which save time where they show nothing more."""
+    """Fewer fast readings, to save time."""
     return [r for r in readings if not isinstance(r, Imu | Torque) or r.stamp_ns % (every_ms * 1_000_000) == 0]
 
 
@@ -257,7 +257,7 @@ S_BEND = (Leg(4, 0.5), Leg(5), Leg(4, 0, 0.25), Leg(5), Leg(4, 0, -0.3), Leg(8))
 
 @cache
 def simulated(seed: int, seconds: float, **options: Any) -> tuple[SiteConfig, MachineConfig, list[Reading], Table]:
-    """Site, machine, readings and true track of one simulated loader."""
+    """Site, machine, readings and true track of a simulated loader."""
     simulator = Simulator(SimConfig(world="fast", machines=1, seed=seed, seconds=seconds, **options), bundle_ms=1000)
     readings: list[Reading] = []
     for _ in range(simulator.bundles or 0):
@@ -275,7 +275,7 @@ def after(reading: Reading, at_s: float) -> bool:
 
 
 def with_ahrs(made: Drive, off_rad: float = 0.0, from_s: float = 0.0, variance: float = 1e-4) -> list[Reading]:
-    """An attitude reference 20 times a second whose heading is off."""
+    """An AHRS at 20 Hz with a heading error."""
     more = [
         Attitude("ahrs", stamp, 0.0, 0.0, math.sin(half), math.cos(half), variance, variance, variance)
         for stamp, heading in zip(made.stamps_ns[::5], made.heading_rad[::5].tolist(), strict=True)
@@ -286,7 +286,7 @@ def with_ahrs(made: Drive, off_rad: float = 0.0, from_s: float = 0.0, variance: 
 
 
 def made_up_samples(n: int, seed: int = 0) -> Table:
-    """Plausible samples, every one different."""
+    """Plausible, all different."""
     rng = np.random.default_rng(seed)
     rows = empty(n)
     rows["stamp_ns"] = START_NS + np.arange(n) * 100_000_000
@@ -298,7 +298,6 @@ def made_up_samples(n: int, seed: int = 0) -> Table:
 
 
 def reckoned(vehicle: MachineConfig, readings: Iterable[Reading], slip: float = 0.0) -> DeadReckoning:
-    """Dead reckoning after all readings."""
     dead_reckoning = DeadReckoning(vehicle, slip)
     for group in by_stamp(readings):
         for reading in group:
@@ -307,7 +306,7 @@ def reckoned(vehicle: MachineConfig, readings: Iterable[Reading], slip: float = 
 
 
 class RunLocaliser(Localiser):
-    """A localiser with the dead reckoning that the pipeline runs for it."""
+    """A localiser with the pipeline's dead reckoning."""
 
     def __init__(self, vehicle: MachineConfig, projection: Projection, config: LocalisationConfig, **more: Any) -> None:
         super().__init__(vehicle, projection, config, **more)
@@ -315,7 +314,7 @@ class RunLocaliser(Localiser):
         self._vehicle = vehicle
 
     def run(self, readings: Iterable[Reading]) -> list[PoseBelief]:
-        """Poses that readings made possible or changed; neighbours of one stamp come together."""
+        """Poses made or changed by readings; neighbours of one stamp come together."""
         poses: list[PoseBelief] = []
         for _, neighbours in groupby(readings, key=attrgetter("stamp_ns")):
             (group,) = by_stamp(neighbours)
@@ -326,7 +325,7 @@ class RunLocaliser(Localiser):
         return poses
 
     def beliefs(self, readings: Iterable[Reading]) -> list[Belief]:
-        """The newest beliefs, as they were known after the readings of each stamp."""
+        """The newest beliefs after each stamp's readings."""
         beliefs: list[Belief] = []
         for _, group in groupby(readings, key=attrgetter("stamp_ns")):
             self.run(group)
@@ -336,6 +335,6 @@ class RunLocaliser(Localiser):
 
 
 def localiser(vehicle: MachineConfig, step_s: float = STEP_S, **options: Any) -> RunLocaliser:
-    """Of a made-up drive, whose wheels do not slip; by the quicker filter unless another is named."""
+    """For a synthetic drive without wheel slip; the faster filter by default."""
     config = LocalisationConfig(**{"filter": "ekf", "slip": 0.0, "slip_soft": 0.0, **options})
     return RunLocaliser(vehicle, PROJECTION, config, step_s=step_s)

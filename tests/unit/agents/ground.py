@@ -1,4 +1,4 @@
-"""Balances, steps and estimates for the tests of ground estimation."""
+"""Balances, steps and estimates for tests of ground estimation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.unit.agents.drives import START_NS
 
 STEP_S = 0.05
 
-# A loader that drives at 2 m/s on level ground of c_rr 0.04.
+# A loader at 2 m/s on level ground, c_rr 0.04.
 STEADY = Balance(
     stamp_ns=START_NS,
     dt_s=STEP_S,
@@ -52,12 +52,11 @@ STEADY = Balance(
 
 
 def after(steps: int, **options: Any) -> Balance:
-    """The steady balance, changed, so many steps after the start."""
+    """The steady balance this many steps later, changed."""
     return replace(STEADY, stamp_ns=START_NS + steps * round(STEP_S * 1e9), distance_m=0.1 * steps, **options)
 
 
 def balances(machine: MachineConfig, readings: Iterable[Reading], *, weighs: bool = True) -> list[Balance]:
-    """The balances of these readings."""
     balancer, dead_reckoning = Balancer(machine, weighs=weighs), DeadReckoning(machine, 0.0)
     made = []
     for reading in readings:
@@ -69,7 +68,7 @@ def balances(machine: MachineConfig, readings: Iterable[Reading], *, weighs: boo
 
 
 class EstimatorRun:
-    """A ground estimator that gets readings, and is asked ten times a second for an estimate of a moment ago."""
+    """A ground estimator fed with readings and asked at 10 Hz for an estimate of a moment ago."""
 
     def __init__(
         self,
@@ -108,16 +107,16 @@ class EstimatorRun:
 
     @property
     def last(self) -> GroundEstimate:
-        """The estimate that was asked for last."""
+        """The last answer."""
         return self.estimates[-1][1]
 
     def between(self, start_s: float, end_s: float) -> list[GroundEstimate]:
-        """Estimates for these seconds of the drive."""
+        """Answers for this time of the drive."""
         return [e for ns, e in self.estimates if start_s <= (ns - START_NS) * 1e-9 < end_s]
 
 
 def level_steps(raw: Iterable[float], *, share: Iterable[float] | float = 0.04) -> list[BalanceStep]:
-    """Steps of a machine that drives forwards on level ground at 2 m/s."""
+    """Level ground, forwards at 2 m/s."""
     raw = list(raw)
     shares = np.broadcast_to(np.array(share, float), len(raw))
     return [
@@ -132,5 +131,5 @@ def feed(estimator: KalmanResistance | RecursiveResistance, steps: Iterable[Bala
 
 
 def white_noise(density: float, n: int, rng: np.random.Generator) -> Floats:
-    """White noise of n steps."""
+    """n steps."""
     return density / math.sqrt(STEP_S) * np.asarray(rng.standard_normal(n))

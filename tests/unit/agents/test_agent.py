@@ -1,4 +1,4 @@
-"""An agent and its samples: pending at once, final later, and nothing pending for ever."""
+"""An agent's samples: pending at once, final later, none pending for ever."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ READINGS = thinned(drive(S_BEND, VEHICLE).readings)
 
 
 class Stream:
-    """Readings in real time, then silence; and the clock that both keep. Counts what lies in the spool."""
+    """Real-time readings, then silence; owns the clock and counts the spooled samples."""
 
     def __init__(self, readings: Sequence[Reading], silent_s: float = 0.0, after: Sequence[Reading] = ()) -> None:
         self.now_s = 50.0
@@ -75,7 +75,7 @@ def session() -> Iterator[Any]:
 
 
 def run(session: Any, folder: Path, stream: Stream, *, config: PipelineConfig = CONFIG, stop_s: float = 1e9) -> Any:
-    """The report of an agent that takes the stream, without any map server; stop_s: when it gets a SIGTERM."""
+    """Report of an agent on the stream without map server; stop_s: time of a SIGTERM."""
     places = Places(folder / "spool.db", folder / "audit")
     agent = stream.agent = Agent(session, SITE, VEHICLE, AgentConfig(config, linger_s=0.0), places)
     try:
@@ -85,7 +85,7 @@ def run(session: Any, folder: Path, stream: Stream, *, config: PipelineConfig = 
 
 
 def in_spool(folder: Path) -> np.ndarray:
-    """All samples that wait, as the next agent would send them."""
+    """All waiting samples, as the next agent would send them."""
     spool = Spool(folder / "spool.db", SpoolConfig())
     head = spool.head(10_000)
     spool.close()
@@ -94,7 +94,7 @@ def in_spool(folder: Path) -> np.ndarray:
 
 
 def by_pipeline(*spans: Sequence[Reading], config: PipelineConfig = CONFIG) -> list[np.ndarray]:
-    """Final samples of readings; each span but the last ends in silence."""
+    """The pipeline's final samples; all spans but the last end in silence."""
     pipeline = Pipeline(SITE, VEHICLE, config)
     rows = []
     for span in spans[:-1]:
@@ -111,7 +111,7 @@ def test_what_is_sent_in_the_end_is_what_the_pipeline_calls_final(session: Any, 
     assert report["samples"] == report["spool"]["recorded"] == len(rows)
     assert report["spool"]["pending"] == 0
     pending = [seen["pending"] for seen in stream.seen[-100:]]
-    a_second = 2.0 / 0.5  # samples, at two metres a second
+    a_second = 2.0 / 0.5  # samples at 2 m/s
     assert min(pending) > (LAG - LAG_S) * a_second
     assert max(pending) < (LAG + 3.0) * a_second
     depth = [seen["depth"] for seen in stream.seen]
@@ -132,7 +132,7 @@ def test_a_machine_that_is_parked_with_its_sensors_off_keeps_nothing_pending(ses
 
 @pytest.mark.slow
 def test_after_a_silence_samples_go_on(session: Any, tmp_path: Path) -> None:
-    """A link that was down, or a machine that was off: what was settled stays so, nothing comes twice."""
+    """After a lost link or a pause: settled samples stay, none comes twice."""
     half = len(READINGS) // 2
     run(session, tmp_path, Stream(READINGS[:half], 15.0, READINGS[half:]))
     rows = in_spool(tmp_path)

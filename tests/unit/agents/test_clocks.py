@@ -1,4 +1,4 @@
-"""Stamps that are far off, and clocks that are apart, as a live agent meets them."""
+"""Far-off stamps and differing clocks in a live agent."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ LEAPS_S = (0.0, 0.3, 2.0, 61.0, 3600.0, DAY, YEARS)
 
 
 def shifted(readings: list[Reading], ahead_s: float, *sensors: str) -> list[Reading]:
-    """These sensors' stamps are ahead; readings come when they came."""
+    """Stamps of these sensors are ahead; arrivals are unchanged."""
     by_ns = round(ahead_s * SECOND)
     return [replace(r, stamp_ns=r.stamp_ns + by_ns) if r.sensor in sensors else r for r in readings]
 
 
 def astray(sensor: str, after_s: float, off_s: float, rows: int = 1) -> list[Reading]:
-    """One sensor has rows that are far off."""
+    """Far-off stamps of some rows of one sensor."""
     late = [i for i, r in enumerate(READINGS) if r.sensor == sensor and r.stamp_ns >= START_NS + after_s * SECOND]
     readings = list(READINGS)
     for i in late[:rows]:
@@ -44,7 +44,7 @@ def astray(sensor: str, after_s: float, off_s: float, rows: int = 1) -> list[Rea
 
 
 def off_m(readings: list[Reading]) -> tuple[np.ndarray, Positioning]:
-    """How far poses are off from 15 s on."""
+    """Position errors from 15 s on."""
     located, off = Positioning(SITE, VEHICLE, EKF), []
     for i in range(0, len(readings), 15):
         located.step(readings[i : i + 15])
@@ -82,7 +82,7 @@ def test_a_stamp_far_off_is_refused_alone_and_the_track_goes_on(
 
 
 def said(readings: list[Reading]) -> tuple[str, str]:
-    """What health and the sentence about missing samples say in the end."""
+    """Final health, and the sentence on missing samples."""
     pipeline, status = Pipeline(SITE, VEHICLE, EKF), Status(VEHICLE)
     for i in range(0, len(readings), 15):
         status.take(readings[i : i + 15])
@@ -112,7 +112,7 @@ def test_clocks_that_are_apart_are_why_there_is_no_sample(
 
 @pytest.mark.slow
 def test_an_offset_that_refuses_nothing_is_named_by_the_motion() -> None:
-    """Fixes come in the order of their stamps, and tell where the machine was two seconds before."""
+    """Fixes come in order, but show the place of two seconds before."""
     legs = [Leg(5, 0.6), Leg(6, 0, 0.2), Leg(3, -1.0), Leg(4), Leg(7, 0.4, -0.2), Leg(5), Leg(7, -0.4), Leg(3)]
     readings = thinned(drive(legs * 2, VEHICLE).readings)
     late = sorted(shifted(readings, 2.0, "gps-1"), key=lambda r: r.stamp_ns)
@@ -128,7 +128,7 @@ def test_a_live_agent_says_why_it_takes_no_larger_delay() -> None:
 
 
 class WatchedPipeline(Pipeline):
-    """Counts the readings that count, and keeps those that the last restart began with."""
+    """Counts used readings and keeps those at the last restart."""
 
     accepted = 0
     restarted: tuple[Reading, ...] = ()
@@ -141,7 +141,7 @@ class WatchedPipeline(Pipeline):
 
 
 def leaping(rng: random.Random) -> list[Reading]:
-    """The clock of all sensors, or of one, is set again and again."""
+    """The clock of all sensors, or of one, is set repeatedly."""
     off_s, leaps, readings = dict.fromkeys(SENSORS, 0.0), set(rng.sample(range(len(READINGS)), 5)), []
     for i, reading in enumerate(READINGS):
         if i in leaps:
@@ -154,7 +154,7 @@ def leaping(rng: random.Random) -> list[Reading]:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", by_night(range(10), day=range(3)))
 def test_clocks_that_leap_never_end_an_agent(seed: int) -> None:
-    """Each reading counts or is counted as refused; what is sampled has a place and a covariance."""
+    """Each reading is used or counted as refused; each sample has a place and covariance."""
     readings, pipeline = leaping(random.Random(seed)), WatchedPipeline(SITE, VEHICLE, EKF)
     made = [pipeline.step(readings[i : i + 15]) for i in range(0, len(readings), 15)]
     pipeline.clocks()
@@ -170,7 +170,7 @@ def test_clocks_that_leap_never_end_an_agent(seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("leap_s", by_night([-3600.0, 3600.0, -DAY], day=[-3600.0]))
 def test_a_clock_that_was_set_is_a_start_anew(leap_s: float) -> None:
-    """Nothing timed from before counts: samples are those of an agent that starts there, bit for bit."""
+    """Nothing older counts: samples equal those of an agent starting there, bit for bit."""
     before, after = READINGS[:1500], iter(shifted(READINGS[1500:], leap_s, *SENSORS))
     pipeline = WatchedPipeline(SITE, VEHICLE, EKF)
     pipeline.step(before)

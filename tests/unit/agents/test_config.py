@@ -28,7 +28,7 @@ def table(name: str) -> dict[str, Any]:
 
 
 def unnamed(config: Any, named: dict[str, Any], place: str = "") -> list[str]:
-    """Options of a nested dataclass that a TOML table does not name."""
+    """Options of a nested dataclass absent from a TOML table."""
     missing = []
     for f in fields(config):
         value = getattr(config, f.name)
@@ -52,7 +52,7 @@ def test_files_name_every_option() -> None:
     assert "\n# [[driver]]\n" in text, "in a comment: the simulator needs none"
     assert all(f"\n# {f.name} = " in text for f in fields(DriverConfig))
     assert {f.name for f in fields(SiteConfig)} == set(table("site.toml"))
-    estimated = "machine_share", "skid_steers"  # without it; so it is in a comment
+    estimated = "machine_share", "skid_steers"  # estimated if absent, hence in a comment
     assert {f.name for f in fields(MachineConfig)} - {"sensors", "powertrain", *estimated} == set(named["machine"])
     for name in (*estimated, *(f.name for f in fields(PowertrainConfig))):
         assert f"\n# {name} = " in text
@@ -74,7 +74,7 @@ def test_file_without_machine_leaves_it_to_the_log(tmp_path: Path) -> None:
 
 
 def test_samples_that_are_late_by_the_lag_are_no_wrong_clock_to_the_server() -> None:
-    """Also beside machines that send at once, and with batches that take a minute."""
+    """Also beside machines that send at once, with batches of a minute."""
     assert MOST_LAG_S + 60 < CLOCK_LIMIT_S
     longest = LocalisationConfig(lag_s=MOST_LAG_S)
     assert AgentConfig(PipelineConfig(longest)).pipeline.localisation.lag_s == MOST_LAG_S

@@ -29,7 +29,7 @@ def test_tracker_equals_least_squares_of_a_parabola_with_fading_weights() -> Non
 
 @pytest.mark.parametrize("rate_hz", [5, 100])
 def test_tracker_starts_in_motion_with_the_first_readings(rate_hz: int) -> None:
-    """A parabola of travel is followed from the third reading on, whatever came before a pause."""
+    """A parabola is tracked from the third reading, whatever preceded a pause."""
     tracker = WheelTracker()
     tracker.update(START_NS - 10**10, 900.0, speed_mps=-7.0)
     for i in range(2 * rate_hz):
@@ -57,7 +57,7 @@ def test_dead_reckoning_closes_a_circle() -> None:
     made = drive([Leg(5, 0.6), Leg(2 * math.pi / 0.2, 0.0, 0.2)], vehicle, heading_rad=0.0, without=("gps-1",))
     reckoning = reckoned(vehicle, made.readings)
     turned = reckoning.pose
-    start = made.at(START_NS + 5_000_000_000)  # where the circle begins
+    start = made.at(START_NS + 5_000_000_000)  # start of the circle
     assert turned.angle_rad == pytest.approx(2 * math.pi, abs=0.01)
     assert turned.travel_m == pytest.approx(reckoning.distance_m)
     assert (turned.x_m, turned.y_m) == pytest.approx((start[0] - 10, start[1] - 20), abs=0.3)
@@ -75,9 +75,9 @@ def test_odometry_is_integrated_over_time_and_a_pause_counts_one_second_at_most(
 
 @pytest.mark.parametrize(("direction", "traction"), [(1, 0.1), (-1, -0.1), (1, -0.1), (1, 1.5)])
 def test_slip_is_taken_off_where_torque_drives_and_added_where_it_brakes(direction: int, traction: float) -> None:
-    """At a drive force of a tenth of the weight and slip 0.2 per traction, it is two per cent of the distance.
+    """Drive force a tenth of the weight, slip 0.2 per traction: 2 % of the distance.
 
-    More than all of the weight is a wrong unit, which counts for nothing.
+    Beyond the whole weight it is a wrong unit and ignored.
     """
     wheels, torque = VEHICLE.sensor("wheels"), VEHICLE.sensor("torque")
     reckoning = DeadReckoning(VEHICLE, slip=0.2)
@@ -96,7 +96,7 @@ def test_slip_is_taken_off_where_torque_drives_and_added_where_it_brakes(directi
 
 
 def test_several_sensors_of_a_kind_count_as_their_mean_and_one_that_dies_leaves_the_other() -> None:
-    """The second gyro is off by 0.02 rad/s, the second wheels turn 10 % too far, and both fall silent after 6 s."""
+    """Second gyro off by 0.02 rad/s, second wheels by 10 %; both fall silent after 6 s."""
     silent_ns, readings = START_NS + 6 * 10**9, []
     for r in drive([Leg(4, 0.5), Leg(8)], DOUBLE).readings:
         if r.sensor == "imu-2":
@@ -106,7 +106,7 @@ def test_several_sensors_of_a_kind_count_as_their_mean_and_one_that_dies_leaves_
         readings += [] if r.stamp_ns > silent_ns and r.sensor.endswith("-2") else [r]
     reckoning = reckoned(DOUBLE, readings)
     assert reckoning.angle_rad == pytest.approx(0.01 * 6, rel=0.02)
-    assert reckoning.travel_m == pytest.approx(1.05 * 8 + 12 - 1.0, abs=0.2)  # half a second's way waits in vain
+    assert reckoning.travel_m == pytest.approx(1.05 * 8 + 12 - 1.0, abs=0.2)  # half a second of travel waits for them
     assert reckoning.wheels.speed_mps == pytest.approx(2.0)
 
 
@@ -121,7 +121,7 @@ def test_wheels_that_speak_again_do_not_count_what_others_counted() -> None:
 @pytest.mark.parametrize("offset_m", [-0.76, 0.0, 0.76])
 @pytest.mark.parametrize("turn", ["imu", "steering"])
 def test_a_wheel_off_the_middle_of_its_axle_shows_the_way_of_the_middle(offset_m: float, turn: str) -> None:
-    """In a bend to the left of 8 m, a wheel 0.76 m left of the middle rolls a tenth less."""
+    """In a left bend of 8 m, a wheel 0.76 m left of the centre rolls a tenth less."""
     wheels = SensorConfig("wheels", "odometry", Mount((0.0, offset_m, 0.0)), measures=("speed",))
     vehicle = MachineConfig("truck", wheelbase_m=2.5, sensors=(wheels, SensorConfig("turn", turn)))
     speed, rate, readings = 2.0, 0.25, []
@@ -148,6 +148,6 @@ def test_restarted_tick_counter_moves_nothing() -> None:
         for r in made.readings
     ]
     before, after = reckoned(VEHICLE, made.readings), reckoned(VEHICLE, readings)
-    assert after.travel_m == pytest.approx(before.travel_m, abs=0.15)  # what was driven between two counts
+    assert after.travel_m == pytest.approx(before.travel_m, abs=0.15)  # travel between two counts
     assert after.distance_m == pytest.approx(before.distance_m, abs=0.15)
     assert after.wheels.speed_mps == pytest.approx(before.wheels.speed_mps, abs=0.1)

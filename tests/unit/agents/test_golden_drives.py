@@ -1,8 +1,7 @@
-"""A golden drive per vehicle: what a whole pipeline makes of it, figure by figure, as it was when they were taken.
+"""A golden drive per vehicle: the pipeline's figures against recorded ones, to notice any change.
 
-Laws and tests of single stages say what is right; these drives notice whatever changes. Where a change is meant,
-`python -m tests.unit.agents.test_golden_drives` takes the figures anew (of all drives, or of
-those that are named), and the difference of the file shows all of it.
+After an intended change `python -m tests.unit.agents.test_golden_drives` records the figures of all or the named
+drives; the file's difference shows the effect.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def config(engine: str = "ekf", *, lag_s: float = 5.0, estimation: Any = None, *
 
 
 def loader(seconds: float = 42.0, **options: Any) -> Case:
-    """All that a simulated loader may have, with outliers, a pause of 2 s, and one fix that comes late."""
+    """All options of a simulated loader, with outliers, a pause of 2 s and a late fix."""
     site, vehicle, readings, _ = simulated(3, 42.0, gps=(1, 2), imu=(1, 3), attitude=(3,), payload=True)
     troubled = [r for r in moved(readings, 60.0, from_s=34, to_s=36) if not after(r, 38) or after(r, 40)]
     late = next(i for i, r in enumerate(troubled) if isinstance(r, Gps) and after(r, 33))
@@ -69,7 +68,7 @@ def loader(seconds: float = 42.0, **options: Any) -> Case:
 
 
 def receivers() -> Case:
-    """Three that share their errors: one goes off and comes back; wheels turn too far, and fall silent."""
+    """Three with shared errors: one drifts off and returns; wheels overcount, then fall silent."""
     vehicle = machine(receivers=3)
     readings = moved(noisy(drive(TOUR, vehicle, ground=SLOPE).readings, 2), 30.0, "gps-2", from_s=20, to_s=26)
     wheels = [
@@ -81,7 +80,7 @@ def receivers() -> Case:
 
 
 def modes(profile: str) -> Case:
-    """Beside an absolute receiver a relative one, which is far off and late, and a differential; so a reference is."""
+    """Beside an absolute receiver a relative one, far off and late, and a differential one; likewise an AHRS."""
     vehicle = changed_sensor(machine(receivers=3), "gps-2", mode="relative", std={"position": 1.5})
     vehicle = changed_sensor(vehicle, "gps-3", mode="differential")
     ahrs = SensorConfig("ahrs", "attitude", mode="relative" if profile == "default" else "differential")
@@ -93,7 +92,7 @@ def modes(profile: str) -> Case:
 
 
 def body() -> Case:
-    """It bends, weighs what it carries, sits on tyres, and drives on known ground; GPS alone shows its start."""
+    """Articulated, weighing, on tyres and known ground; only GPS gives its start."""
     bodied = machine(wheelbase_m=3.3, axle_stiffness_npm=1.8e6, cog_height_m=1.05, payload_x_m=4.7, payload_z_m=0.85)
     more = SensorConfig("joint", "articulation"), SensorConfig("scale", "payload")
     vehicle = replace(bodied, sensors=(*bodied.sensors, *more))
@@ -104,7 +103,7 @@ def body() -> Case:
 
 
 def faulty() -> Case:
-    """Torque that is stuck, then a receiver that repeats itself, then an accelerometer in g."""
+    """Stuck torque, a repeating receiver, an accelerometer in g."""
     made = noisy(drive([Leg(2), Leg(4, 0.5), *[Leg(3, 0.6), Leg(3, -0.6)] * 6], VEHICLE, ground=SLOPE).readings, 5)
     kept, readings = next(r for r in made if isinstance(r, Gps) and after(r, 22)), []
     for r in made:
@@ -119,7 +118,7 @@ def faulty() -> Case:
 
 
 def truck(*sensors: SensorConfig) -> Case:
-    """Without an IMU: the turn comes from steering or from odometry, both of them off."""
+    """No IMU: turn rate from steering or odometry, both with errors."""
     vehicle = trucks.truck(*sensors)
     wrong = trucks.Wrong(steering_rad=0.02, rate_radps=0.01)
     made = trucks.driven(vehicle, wrong, [Leg(6, 0.5), Leg(8), Leg(12, 0, 0.25), Leg(12, 0, -0.25)], seed=1)
@@ -127,7 +126,7 @@ def truck(*sensors: SensorConfig) -> Case:
 
 
 def cart() -> Case:
-    """A log that begins in motion, at 10 Hz: a gyro without accelerometer, odometry, and an encoder at the side."""
+    """Starts in motion, 10 Hz: gyro without accelerometer, odometry, an encoder at the side."""
     left = SensorConfig("left", "encoder", Mount((0.0, 0.7, 0.0)))
     vehicle = carts.cart(carts.GYRO, carts.ODOMETRY, left, carts.GPS)
     made = drive(carts.TOUR[:5], vehicle)
@@ -135,7 +134,7 @@ def cart() -> Case:
 
 
 def with_doppler() -> Case:
-    """Velocities show the wheels' scale, and hold the position where fixes are away."""
+    """Doppler shows the wheel scale and holds the position without fixes."""
     made = drive(TOUR, doppler.WITH_DOPPLER)
     velocities = doppler.doppler(made, seed=3, std_mps=0.1)
     blind = doppler.silenced(doppler.larger_wheels(noisy(made.readings, 6), 1.08), 30.0)
@@ -160,11 +159,11 @@ CASES: dict[str, Callable[[], Case]] = {
     "doppler": with_doppler,
 }
 ROWS, DIGITS = 6, 8
-AT_NIGHT = ("loader, paper ekf", "modes", "modes, paper")  # the profile has another drive by day, modes have tests
+AT_NIGHT = ("loader, paper ekf", "modes", "modes, paper")  # the profile has a day drive, modes have tests
 
 
 def figures(case: Case) -> dict[str, Any]:
-    """Some samples, pending and final, the last belief, and all of health."""
+    """Some pending and final samples, the last belief, all of health."""
     site, vehicle, readings, options = case
     known = Calibration(0.003, 0.01, ((4e-6, 0.0), (0.0, 4e-4)), START_NS - 10**9, 80)
     pipeline = Pipeline(site, vehicle, options, known)
@@ -183,7 +182,7 @@ def figures(case: Case) -> dict[str, Any]:
 
 
 def flat(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Its numbers and words, by where they stand."""
+    """Its leaves by path."""
     if isinstance(value, dict):
         for name in sorted(value):
             yield from flat(value[name], f"{path}.{name}".lstrip("."))

@@ -38,7 +38,7 @@ def run(
 
 @pytest.mark.slow
 def test_withheld_fixes_never_reach_the_pipeline(vehicle: MachineConfig, made: Drive) -> None:
-    """A withheld fix far off would show in the poses, a seen one in the counters."""
+    """A far-off withheld fix would show in the poses, a used one in the counters."""
     holdout = Holdout(SITE, vehicle, CONFIG)
     seen = holdout.split(made.readings)
     withheld = set(made.readings) - set(seen)
@@ -68,7 +68,7 @@ def test_errors_are_right_on_a_made_up_case(vehicle: MachineConfig, made: Drive)
     assert report["median_m"] == pytest.approx(off_m, abs=0.5)
     none = {"fixes": 0, **dict.fromkeys(FIGURES)}
     assert run(vehicle, made.readings[:100])[1] == none
-    assert report["expected_rms_m"] == pytest.approx(off_m, abs=1.0)  # none of it was believed before
+    assert report["expected_rms_m"] == pytest.approx(off_m, abs=1.0)  # never believed before
 
 
 @pytest.mark.slow
@@ -80,7 +80,7 @@ def test_fixes_are_compared_with_the_poses_of_when_they_were_true(vehicle: Machi
         run(v, r)[1]
         for v, r in ((vehicle, made.readings), (changed_sensor(vehicle, "gps-1", delay_s=delay_s), readings))
     ]
-    assert reports[1]["rms_m"] == pytest.approx(reports[0]["rms_m"], abs=0.1)  # it drives 0.6 m meanwhile
+    assert reports[1]["rms_m"] == pytest.approx(reports[0]["rms_m"], abs=0.1)  # it moves 0.6 m meanwhile
 
 
 def test_velocities_are_withheld_with_the_fixes_and_judged_by_nobody(made: Drive) -> None:

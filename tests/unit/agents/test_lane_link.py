@@ -1,4 +1,4 @@
-"""Lanes come as they are asked for, again after a while, and only those that are new; without a link the last hold."""
+"""Lanes: loaded on demand, refreshed, only if newer; kept without a link."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ BEGIN_S = 1e9
 
 
 class Network:
-    """A session whose server has tiles by place, and answers the questions that are kept here."""
+    """A session with tiles by place that records its queries."""
 
     def __init__(self) -> None:
         self.asked: list[LanesQuery] = []
@@ -52,7 +52,7 @@ def test_lanes_are_kept_up_to_date():
     network = Network()
     link = LaneLink(network, "site")  # type: ignore[arg-type]
     assert link.look(None) is None
-    assert not network.asked  # nobody knows yet where the machine is
+    assert not network.asked  # place of the machine unknown
     for now_s in (-100.0, -99.0, -98.0):  # nobody has driven
         assert link.look(at(3.0, now_s)) is None
     network.tiles = {(0, 0): 10, (1, 0): 20}
@@ -65,7 +65,7 @@ def test_lanes_are_kept_up_to_date():
 
     network.tiles[0, 0] = 30
     network.is_up = False
-    for now_s in np.arange(3.0, 2.0 + (SLOWER + 4) * AGAIN_S, 1.0):  # the link is down: it asks now and then
+    for now_s in np.arange(3.0, 2.0 + (SLOWER + 4) * AGAIN_S, 1.0):  # no link: rare retries
         assert link.look(at(3.0, float(now_s))) is None
     assert len(network.asked) - 2 == 4
     network.is_up = True
@@ -83,9 +83,9 @@ def test_lanes_are_asked_for_ever_more_seldom():
     for now_s in range(8 * 3600):
         link.look(at(3.0, float(now_s)))
         if now_s == 3599:
-            assert len(network.asked) == 3  # of 8 to 15 kB each
+            assert len(network.asked) == 3  # 8 to 15 kB each
     assert 8 * 3600 / MOST_S < len(network.asked) < 8 * 3600 / MOST_S + 6
-    link.look(at(3.0, -1e6))  # its clock was set back
+    link.look(at(3.0, -1e6))  # clock set back
     assert network.asked[-1].since_ns == 10
 
 
@@ -98,7 +98,7 @@ def test_lanes_are_asked_for_anew_far_away_and_after_a_decision():
     link.look(at(MOVED_M + 1, MOST_S + 1))
     assert network.asked[-1].since_ns is None
     assert link.look(at(MOVED_M + 1, MOST_S + 2))
-    network.fact = 1  # a machine was excluded: squares without new samples are others too
+    network.fact = 1  # a machine was excluded: squares without new samples change too
     link.look(at(MOVED_M + 1, 2 * MOST_S + 3))
     assert network.asked[-1].since_ns == 10
     assert link.look(at(MOVED_M + 1, 2 * MOST_S + 4)) is None

@@ -46,9 +46,9 @@ SECOND = 10**9
 
 @pytest.fixture(scope="module")
 def recorded() -> list[Reading]:
-    """A simulated drive of 26 s, with what happens on sites: a stop, outliers, a pause, a late reading.
+    """A simulated drive of 26 s with site events.
 
-    At 12 s the machine stands for 2 s; from 15 to 18 s fixes are 60 m off; at 20 s nothing is heard for 3 s.
+    A 2 s stop at 12 s; fixes 60 m off from 15 to 18 s; silence of 3 s at 20 s.
     """
     stop_ns, stand_ns = START_NS + 12 * SECOND, 2 * SECOND
     readings = thinned(simulated(3, 26.0)[2], 20)
@@ -70,12 +70,12 @@ def recorded() -> list[Reading]:
 
 
 def lagging(lag_s: float, **options: Any) -> PipelineConfig:
-    """From where the simulated drive begins: a start that is given needs no proof."""
+    """From the simulated drive's start: a given start needs no proof."""
     return PipelineConfig(LocalisationConfig("ekf", lag_s=lag_s, start=(29.143, 18.503, -0.339), **options))
 
 
 LAG = 5.0  # samples become final within these drives
-STARTED = PipelineConfig(LocalisationConfig("ekf", start=START))  # of made-up drives
+STARTED = PipelineConfig(LocalisationConfig("ekf", start=START))  # of synthetic drives
 Base = tuple[bytes, bytes, Any]
 
 
@@ -84,7 +84,7 @@ def simulated_pipeline(vehicle: MachineConfig, config: PipelineConfig | None = N
 
 
 def run(vehicle: MachineConfig, readings: list[Reading]) -> Base:
-    """Pending samples and final ones, as bytes, and health."""
+    """Pending and final samples as bytes, and health."""
     pipeline = simulated_pipeline(vehicle)
     samples = pipeline.step(readings)
     return samples.pending.tobytes(), samples.final.tobytes(), pipeline.health()
@@ -149,7 +149,7 @@ def test_strange_and_doubled_readings_are_counted_and_change_nothing(
 @pytest.mark.slow
 @pytest.mark.parametrize(("jump_s", "reason"), [(3600, "gap_restarts"), (-3600, "clock_back_restarts")])
 def test_a_start_that_is_told_counts_once(jump_s: int, reason: str) -> None:
-    """Behind a pause or a jump of the clock the machine is elsewhere, and waits for fixes to show it where."""
+    """After a pause or clock jump the machine is elsewhere and waits for fixes."""
     made, jump_ns = drive([Leg(4, 1.0), Leg(26)], VEHICLE), START_NS + 20 * SECOND
     readings = thinned(made.readings)
     located = Positioning(SITE, VEHICLE, STARTED)
@@ -169,7 +169,7 @@ def test_a_start_that_is_told_counts_once(jump_s: int, reason: str) -> None:
 def test_a_machine_that_lacks_sensors_gives_samples_without_resistance_or_slope(
     without: tuple[str, ...], measures: tuple[str, ...], has_slope: bool
 ) -> None:
-    """An IMU without accelerometer too: its columns of force are filled with something."""
+    """Also an IMU without accelerometer, whose force columns hold arbitrary values."""
     made = drive([Leg(4, 0.5), Leg(16)], VEHICLE, without=without)
     vehicle = changed_sensor(VEHICLE, "imu", measures=measures) if measures else VEHICLE
     rows = Pipeline(SITE, vehicle, STARTED).step(thinned(made.readings, 20)).pending
@@ -182,7 +182,7 @@ def test_a_machine_that_lacks_sensors_gives_samples_without_resistance_or_slope(
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_machine_that_aligns_late_loses_nothing_of_its_drive() -> None:
-    """GPS comes up two minutes into the drive, longer than poses are remembered."""
+    """GPS comes two minutes into the drive, beyond the memory of poses."""
     made = drive([Leg(4, 0.5), *[Leg(10), Leg(5, 0, 0.3)] * 8, *S_BEND[1:]], VEHICLE)
     readings = [r for r in thinned(made.readings) if not isinstance(r, Gps) or seconds(r) > 120]
     pipeline = Pipeline(SITE, VEHICLE, PipelineConfig(LocalisationConfig("ekf")))
@@ -209,7 +209,7 @@ def test_without_a_lag_samples_are_final_at_once(
 def test_samples_are_final_once_the_lag_is_over_at_the_smoothed_place(
     vehicle: MachineConfig, recorded: list[Reading]
 ) -> None:
-    """What is final is what the smoother, asked apart, says of the place; the last of them as the stream ends."""
+    """Final samples equal the separate smoother's; the last come at the stream's end."""
     site, config = simulated(3, 26.0)[0], lagging(LAG)
     pipeline, apart = Pipeline(site, vehicle, config), Positioning(site, vehicle, config)
     pending, final, nodes = [], [], []
@@ -221,7 +221,7 @@ def test_samples_are_final_once_the_lag_is_over_at_the_smoothed_place(
         final.append(samples.final)
         assert pipeline.pending == sum(map(len, pending)) - sum(map(len, final))
         if len(samples.final):
-            assert LAG <= (now_ns - samples.final["stamp_ns"][-1]) * 1e-9 <= LAG + 5.0  # nothing is heard for 3 s
+            assert LAG <= (now_ns - samples.final["stamp_ns"][-1]) * 1e-9 <= LAG + 5.0  # silence of 3 s
     samples = pipeline.finish()
     rows, made = np.concatenate([*final, samples.final]), np.concatenate([*pending, samples.pending])
     assert (pipeline.pending, len(rows)) == (0, len(made))
@@ -248,7 +248,7 @@ def test_samples_are_final_once_the_lag_is_over_at_the_smoothed_place(
 def test_every_sample_becomes_final_whatever_happens(
     vehicle: MachineConfig, recorded: list[Reading], seed: int
 ) -> None:
-    """Pauses, clocks set forward and back, silence in which all is settled: none is left out, none comes twice."""
+    """Pauses, clock jumps, silence that settles all: no sample is missing or doubled."""
     rng = np.random.default_rng(seed)
     pipeline = simulated_pipeline(vehicle, lagging(float(rng.choice([1.0, 4.0, 30.0]))))
     cuts = sorted(rng.choice(len(recorded), 6).tolist())
@@ -274,7 +274,7 @@ FAIL_S, HEAL_S = 10.0, 22.0
 
 
 def off_m(made: Drive, row: np.void) -> float:
-    """How far a sample lies from where the load centre was."""
+    """Distance of a sample from the true load centre."""
     x, y, heading = made.at(int(row["stamp_ns"]))
     return math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y))
 
@@ -286,7 +286,7 @@ def off_m(made: Drive, row: np.void) -> float:
 def test_sensor_that_fails_costs_the_resistance_and_nothing_else(
     kind: type[Reading], broken: dict[str, float], reason: str
 ) -> None:
-    """Places and gradients go on; the reason is counted and, while it lasts, reported; then resistance is back."""
+    """Places and gradients continue; the reason is counted, reported while it lasts, then resistance returns."""
     made = drive(LONG, VEHICLE, ground=Ground(0.05, 0.1))
     readings = [
         replace(r, **broken) if isinstance(r, kind) and FAIL_S < seconds(r) < HEAL_S else r  # type: ignore[arg-type]
@@ -302,7 +302,7 @@ def test_sensor_that_fails_costs_the_resistance_and_nothing_else(
     check_samples(rows, SITE.extent_m)
     at_s = (rows["stamp_ns"] - START_NS) * 1e-9
     failed = rows[(at_s > FAIL_S + 4) & (at_s < HEAL_S)]
-    assert len(failed) == pytest.approx(2 * (HEAL_S - FAIL_S - 4) * 2.6, rel=0.2)  # one each 0.5 m at 2.6 m/s
+    assert len(failed) == pytest.approx(2 * (HEAL_S - FAIL_S - 4) * 2.6, rel=0.2)  # one per 0.5 m at 2.6 m/s
     assert failed["distance_m"].sum() == pytest.approx((HEAL_S - FAIL_S - 4) * 2.6, rel=0.15)
     assert np.isnan(failed["c_rr"]).all()
     slope = np.hypot(failed["grade_e"], failed["grade_n"])
@@ -315,7 +315,7 @@ def test_sensor_that_fails_costs_the_resistance_and_nothing_else(
     assert pipeline.health()["ground"]["fault"] == ""
 
 
-# --- what is carried on ----------------------------------------------------------------------------------------------
+# --- the end ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -346,7 +346,7 @@ def test_calibration_is_handed_over_a_pause_and_to_the_next_pipeline() -> None:
 
 @pytest.mark.parametrize(("std_m", "c_rr"), [(1.0, 0.04), (3.0, None)])
 def test_known_ground_has_to_be_all_around_an_unsure_position(std_m: float, c_rr: float | None) -> None:
-    """8 m from its edge: 3 m, and twice the standard deviation."""
+    """8 m inside its edge: 3 m plus twice the std."""
     pad = KnownGround("pad", 0.04, ((0.0, 0.0), (40.0, 0.0), (40.0, 40.0), (0.0, 40.0)))
     pipeline = Pipeline(replace(SITE, known_ground=(pad,)), VEHICLE, PipelineConfig())
     pipeline._positioning.poses.append(PoseBelief(START_NS, 8.0, 20.0, 0.0, 2.0, std_m**2 * np.eye(2)))
@@ -358,7 +358,7 @@ def test_known_ground_has_to_be_all_around_an_unsure_position(std_m: float, c_rr
 
 @pytest.mark.slow
 def test_samples_do_not_depend_on_the_truth(tmp_path: Path) -> None:
-    """Two recordings of the same drive, one of them with its truth moved by 100 m."""
+    """Two recordings of a drive, the truth of one shifted by 100 m."""
     config = SimConfig(world="fast", machines=1, seed=5, seconds=20.0)
     samples: list[bytes] = []
     for name in ("a", "b"):
@@ -388,11 +388,11 @@ def move_truth(folder: Path, by_m: float) -> None:
 def test_no_reading_carries_truth() -> None:
     names = {name for kind in KINDS for name in columns(kind)}
     assert not [n for n in names if "true" in n or "truth" in n]
-    # what only the simulator knows, by name
+    # simulator-only names
     assert not names & {"x_m", "y_m", "yaw_rad", "heading_rad", "c_rr", "grade_e", "grade_n", "slip"}
 
 
-# --- options of sensors that the pipeline itself sees to ----------------------------------------------------------
+# --- sensor options handled by the pipeline --------------------------------------------------------------------------
 
 
 @pytest.mark.nightly
@@ -408,7 +408,7 @@ def test_sensor_that_is_not_used_is_as_if_it_were_not_there(vehicle: MachineConf
 def test_sensors_whose_stamps_are_off_by_their_delay_are_as_ones_in_time(
     vehicle: MachineConfig, recorded: list[Reading], base: Base, delay_s: float, sensors: str
 ) -> None:
-    """Too early by more than any window too, for a reading comes when it was true whatever its stamp says."""
+    """Also stamps early beyond every window: readings come at the true time."""
     off = [
         replace(r, stamp_ns=r.stamp_ns + round(delay_s * SECOND)) if r.sensor.startswith(sensors) else r
         for r in recorded
@@ -419,7 +419,7 @@ def test_sensors_whose_stamps_are_off_by_their_delay_are_as_ones_in_time(
 
 @pytest.mark.slow
 def test_fixes_far_from_the_site_are_refused_and_counted() -> None:
-    """A receiver without a fix yet states the equator; they would turn the heading that is found from fixes."""
+    """A receiver without a fix states the equator; such fixes would spoil the heading."""
     made = drive(S_BEND, VEHICLE)
     lost = [
         replace(r, lat_deg=0.0, lon_deg=0.0) if isinstance(r, Gps) and seconds(r) < 5.1 else r
@@ -433,7 +433,7 @@ def test_fixes_far_from_the_site_are_refused_and_counted() -> None:
 
 @pytest.mark.slow
 def test_a_proven_heading_that_fixes_refute_is_found_anew() -> None:
-    """A machine that is turned by a crane after 45 s, while its gyro sleeps."""
+    """A crane turns the machine at 45 s with a dead gyro."""
     made = drive([Leg(4, 1.5), Leg(56)], VEHICLE)
     about, turn_rad, readings = complex(*made.at(START_NS + 45 * SECOND)[:2]), 1.5, []
     for r in thinned(made.readings):
@@ -490,7 +490,7 @@ def test_a_correction_is_interpolated_between_nodes_and_waits_for_the_one_behind
 
 @pytest.mark.parametrize("at_once", [False, True])
 def test_nodes_are_kept_until_their_poses_were_corrected_and_no_longer(at_once: bool) -> None:
-    """Also after a late alignment, with minutes of nodes and of samples in one step."""
+    """Also after a late alignment, with minutes of nodes and samples in one step."""
     track, nodes = SmoothedTrack(), [node(second, (float(second), 0.0, 0.0)) for second in range(600)]
     for some in [nodes] if at_once else [[one] for one in nodes]:
         track.append(some)

@@ -1,4 +1,4 @@
-"""The place jumps while the wheels run on: no sample is wrong and sure, whichever place was right."""
+"""Position jumps with wheels still counting: no sample is wrong and certain, whichever place was right."""
 
 import math
 from collections.abc import Callable
@@ -23,12 +23,12 @@ from tests.unit.agents.test_receiver_faults import SLOW_S, SLOW_SHARE, STD_M, sh
 
 LEGS = (Leg(3), Leg(4, 1.0), Leg(6), *[Leg(5, 0.0, 0.25), Leg(7), Leg(4, 0.0, -0.3), Leg(6)] * 5)  # 123 s
 SEED, AT_S = 1, 60.0
-Off = Callable[[float], float]  # how far fixes are off, by the time
+Off = Callable[[float], float]  # fix error by time
 
 
 @cache
 def measured(receivers: int) -> tuple[MachineConfig, list[Reading]]:
-    """The drive as receivers with slow and white errors have it."""
+    """The drive by receivers with slow and white errors."""
     own = machine(receivers=receivers)
     slow = {"drift_share": SLOW_SHARE, "drift_time_s": SLOW_S}
     own = replace(own, sensors=tuple(replace(s, **slow) if s.kind == "gps" else s for s in own.sensors))
@@ -45,7 +45,7 @@ def measured(receivers: int) -> tuple[MachineConfig, list[Reading]]:
 
 
 def replayed(off: Off, receivers: int = 1, hit: tuple[str, ...] = ("gps-1", "gps-2")) -> tuple[Floats, Bools, Any, str]:
-    """When final samples are, which are off by over 5 m at a stated error below 3 m; health, and what it said."""
+    """Times of final samples, those over 5 m off with a stated error below 3 m, health and its sentence."""
     own, readings = measured(receivers)
     pipeline = Pipeline(SITE, own, PipelineConfig(LocalisationConfig("ekf", slip=0.0, slip_soft=0.0)))
     made, said = [], ""

@@ -1,6 +1,6 @@
-"""Receivers that are off, hang or repeat themselves: positions recover, and nothing wrong reaches the map.
+"""Receivers off, frozen or repeating: positions recover and nothing wrong reaches the map.
 
-The drive is made up, with a slow and a white error of the receiver; each fault is judged beside the drive without it.
+Synthetic drives with slow and white receiver errors; each fault is compared with the faultless drive.
 """
 
 import math
@@ -20,7 +20,7 @@ from protocol.arrays import Floats
 from protocol.machine.readings import Gps, Reading
 from tests.unit.agents.drives import PROJECTION, SITE, VEHICLE, Leg, changed_sensor, drive, noisy, seconds, thinned
 
-STD_M, SLOW_SHARE, SLOW_S = 1.2, 0.75, 45.0  # of the receiver, as it states and as a machine's description has it
+STD_M, SLOW_SHARE, SLOW_S = 1.2, 0.75, 45.0  # as stated by the receiver and configured
 RECEIVER = changed_sensor(VEHICLE, "gps-1", drift_share=SLOW_SHARE, drift_time_s=SLOW_S)
 LEGS = (Leg(3), Leg(4, 1.0), Leg(6), *[Leg(5, 0.0, 0.25), Leg(7), Leg(4, 0.0, -0.3), Leg(6)] * 3)  # 79 s
 SETTLED_S = 25.0  # of good input
@@ -35,7 +35,7 @@ def shifted(fix: Gps, east_m: float, north_m: float, std_m: float = STD_M) -> Gp
 
 
 def off(metres: Callable[[float], float], *, states: bool) -> Fault:
-    """A receiver that has just started is so far off after some seconds."""
+    """Error by time, as of a receiver just started."""
 
     def changed(fix: Gps) -> Gps:
         off_m = metres(seconds(fix))
@@ -45,7 +45,7 @@ def off(metres: Callable[[float], float], *, states: bool) -> Fault:
 
 
 def frozen(begin_s: float, end_s: float) -> Fault:
-    """A receiver that hangs: it repeats its last fix bit for bit."""
+    """A frozen receiver repeating its last fix."""
 
     def changed(readings: list[Reading]) -> list[Reading]:
         last = next(r for r in reversed(readings) if isinstance(r, Gps) and seconds(r) < begin_s)
@@ -58,7 +58,7 @@ def frozen(begin_s: float, end_s: float) -> Fault:
 
 
 def held(readings: list[Reading]) -> list[Reading]:
-    """A table at the rate of the IMU, in which each fix of 1 Hz stands until the next."""
+    """A table at IMU rate holding each 1 Hz fix until the next."""
     kept: Gps | None = None
     table: list[Reading] = []
     for r in readings:
@@ -71,7 +71,7 @@ def held(readings: list[Reading]) -> list[Reading]:
     return table
 
 
-FAULTS: dict[str, tuple[Fault, float]] = {  # of public reports by users of receivers, and when fixes are good again [s]
+FAULTS: dict[str, tuple[Fault, float]] = {  # from users' public reports; end of the fault [s]
     "off, and says so": (off(lambda s: 30.0 * (s < 6), states=True), 6.0),
     "off, and sure": (off(lambda s: 25.0 * (s < 20), states=False), 20.0),
     "converging": (off(lambda s: 40.0 * math.exp(-s / 4), states=True), 16.0),
@@ -84,7 +84,7 @@ AT_NIGHT = ("off, and sure", "converging", "frozen from the start")
 
 @cache
 def measured() -> list[Reading]:
-    """The drive with the errors of a receiver; a quarter of the fast readings are enough here, and save time."""
+    """The drive with receiver errors; a quarter of the fast readings, to save time."""
     rng, slow_m = np.random.default_rng(SEED), math.sqrt(SLOW_SHARE) * STD_M
     readings, error = [], slow_m * rng.standard_normal(2)
     kept = math.exp(-0.2 / SLOW_S)
@@ -98,7 +98,7 @@ def measured() -> list[Reading]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Errors [m] and their normalised squares of live poses (n,), their times [s], and errors of final samples (k,)."""
+    """Live poses: errors [m], normalised squares (n,), times [s]; errors of final samples (k,)."""
 
     seconds: Floats
     off_m: Floats
@@ -162,7 +162,7 @@ def test_a_receiver_that_hangs_is_named_and_one_that_does_not_is_not() -> None:
 
 
 def test_a_parked_machine_s_receiver_has_no_fault() -> None:
-    """It pins its fix: that is one value, and no fault as long as no wheel turns."""
+    """It pins its fix; constant values are no fault while no wheel turns."""
     pipeline = Pipeline(SITE, VEHICLE, PipelineConfig())
     pipeline.step(thinned(drive([Leg(20)], VEHICLE).readings))
     health = pipeline.health()

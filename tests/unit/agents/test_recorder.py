@@ -1,4 +1,4 @@
-"""[record]: bounded, and no reason for a machine to stop."""
+"""[record]: bounded, never stopping a machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BEGIN_NS = 10**18
 
 
 class Recorder:
-    """A recorder, and the time that it knows."""
+    """A recorder and its clock."""
 
     def __init__(self, folder: Path, max_mb: float) -> None:
         self.now_s = 0.0
@@ -28,13 +28,13 @@ class Recorder:
     def drive(self, seconds: int) -> None:
         for _ in range(seconds):
             self.recorder.take(READINGS[:200])
-            self.now_s += 10.0  # more than between two flushes
+            self.now_s += 10.0  # longer than a flush interval
             self.recorder.tend()
 
 
 def test_the_oldest_files_make_room_and_others_stay(tmp_path: Path):
     max_mb = 0.2
-    (tmp_path / f"{VEHICLE.name}-2.20260101T000000.000000Z.mcap").touch()  # of another machine
+    (tmp_path / f"{VEHICLE.name}-2.20260101T000000.000000Z.mcap").touch()  # another machine's
     (tmp_path / f"{VEHICLE.name}.20010101T000000.000000Z.mcap.part").write_bytes(bytes(1000))  # left by a kill
     recorder = Recorder(tmp_path, max_mb)
     recorder.drive(100)

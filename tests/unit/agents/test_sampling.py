@@ -25,7 +25,7 @@ def pose(seconds: float, x_m: float = 0.0, heading_rad: float = 0.0, variance_m2
 
 
 class Asked:
-    """An estimator that notes what it is asked for."""
+    """An estimator that records its queries."""
 
     def __init__(self, estimate: GroundEstimate) -> None:
         self.stamps_ns: list[int] = []
@@ -37,7 +37,7 @@ class Asked:
 
 
 def drive(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, **options: float) -> Table:
-    """Drive 10 m east at 2 m/s from x = 0, with a pose and a look at the wheels every 50 ms; then wait for the lag."""
+    """10 m east at 2 m/s from x = 0, poses and wheels at 20 Hz, then the lag."""
     rows = []
     for i in range(101):
         sampler.poses.append(pose(i * 0.05, 0.1 * i, **options))
@@ -47,11 +47,11 @@ def drive(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, **options: floa
 
 
 def sampled(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, now_s: float = 0.0) -> Table:
-    """What is due once the lag has passed."""
+    """Due after the lag."""
     return sampler.due_samples(ns(now_s + LAG_S), Asked(estimate))
 
 
-# --- one per stretch, where the machine was --------------------------------------------------------------------------
+# --- one per stretch, at the machine's place -------------------------------------------------------------------------
 
 
 def test_one_sample_per_stretch_that_says_how_long_it_is() -> None:
@@ -100,7 +100,7 @@ def moved(by_m: float, turn_rad: float, variance_m2: float) -> Callable[[PoseBel
 
 
 def test_final_sample_is_that_of_the_corrected_pose() -> None:
-    """Load centre and gradient turn with the heading; what was measured at the place stays."""
+    """Load centre and gradient turn with the heading; measured values stay."""
     sampler = Sampler(1.5)
     (pending,) = drive(sampler)[:1]
     (final,) = sampler.final_samples(lambda p: moved(3.0, 0.5, 0.25)(p) if p.x_m < 0.75 else None)
@@ -113,7 +113,7 @@ def test_final_sample_is_that_of_the_corrected_pose() -> None:
     assert [final[name] for name in same] == [pending[name] for name in same]
 
 
-# --- what is withheld ------------------------------------------------------------------------------------------------
+# --- withheld --------------------------------------------------------------------------------------------------------
 
 
 def test_marks_before_the_first_pose_are_counted() -> None:
@@ -148,7 +148,7 @@ def test_what_is_not_known_of_the_ground_is_counted_and_the_rest_is_sampled(
 
 def test_samples_of_an_unsure_place_are_withheld_and_counted() -> None:
     sampler = Sampler(0.0)
-    assert not len(drive(sampler, variance_m2=201.0))  # that north is twice as much, a deviation of 20.05 m
+    assert not len(drive(sampler, variance_m2=201.0))  # twice as much north: std 20.05 m
     assert sampler.withheld == {"unsure_position": 20}
 
 
@@ -157,7 +157,7 @@ def test_samples_of_an_unsure_place_are_withheld_and_counted() -> None:
 
 @pytest.mark.parametrize("speed_mps", [2.0, -2.0], ids=["forwards", "reverse"])
 def test_distance_goes_on_by_the_filter_s_speed_when_wheels_fall_silent(speed_mps: float) -> None:
-    """From when they fell silent, which is noticed half a second later; up in reverse too."""
+    """From their last reading, noticed 0.5 s later; increasing in reverse too."""
     odometer = Odometer()
     odometer.update(ns(0.0), ns(0.0), 5.0, speed_mps)
     distances = [odometer.update(ns(i * 0.01), ns(0.0), 5.0, speed_mps) for i in range(1, 1001)]
@@ -169,9 +169,9 @@ def test_distance_goes_on_by_the_filter_s_speed_when_wheels_fall_silent(speed_mp
 def test_wheels_that_are_read_again_count_on_and_nothing_twice() -> None:
     odometer = Odometer()
     odometer.update(ns(0.0), ns(0.0), 5.0, 2.0)
-    for i in range(1, 301):  # dead reckoning goes on over ground
+    for i in range(1, 301):  # dead reckoning over ground continues
         before = odometer.update(ns(i * 0.01), ns(0.0), 5.0 + 0.02 * i, 2.0)
-    assert odometer.update(ns(3.01), ns(3.01), 11.0, 2.0) == pytest.approx(before)  # counted from where they were
+    assert odometer.update(ns(3.01), ns(3.01), 11.0, 2.0) == pytest.approx(before)  # counted from their last place
     after = odometer.update(ns(3.05), ns(3.05), 11.1, 2.0)
     assert after == pytest.approx(before + 0.1)
 
@@ -182,14 +182,14 @@ def test_noise_of_the_filter_s_speed_at_a_standstill_is_no_distance() -> None:
     assert [odometer.update(ns(i * 0.01), 0, 0.0, 0.29 * (-1) ** i) for i in range(1, 1000)] == [start] * 999
 
 
-# --- where the machine was -------------------------------------------------------------------------------------------
+# --- past poses ------------------------------------------------------------------------------------------------------
 
 
 def test_history_interpolates_between_its_ends_and_takes_the_short_way_across_the_back_heading() -> None:
     history = PoseHistory()
     assert history.at(100 * S) is None
     history.append(pose(0, 1.0))
-    history.append(pose(0, 0.0, math.pi - 0.1))  # of the same stamp: it replaces the last
+    history.append(pose(0, 0.0, math.pi - 0.1))  # same stamp: replaces the last
     history.append(pose(1, 4.0, -math.pi + 0.3, variance_m2=3.0))
     middle = history.at(100 * S + S // 2)
     assert math.remainder(middle.heading_rad - (math.pi + 0.1), math.tau) == pytest.approx(0, abs=1e-12)
@@ -209,7 +209,7 @@ def test_history_forgets_but_never_what_it_has_to_keep() -> None:
 
 
 def test_fuel_of_a_sample_is_what_was_burned_while_it_moved() -> None:
-    """36 l/h are a hundredth of a litre a second, but none while it stands; a pause leaves its stretch unknown."""
+    """36 l/h are 0.01 l/s, none at standstill; after a pause a stretch has none."""
     meter = FuelMeter()
     assert math.isnan(meter.take(ns(0.0)))
     for i in range(11):
@@ -223,5 +223,5 @@ def test_fuel_of_a_sample_is_what_was_burned_while_it_moved() -> None:
     meter.add(FuelRate("fuel", ns(4.2), 36.0), 2.0)
     assert meter.take(ns(4.3)) == pytest.approx(0.002)
     assert math.isnan(meter.take(ns(9.0)))
-    meter.add(FuelRate("fuel", ns(1.0), 36.0), 2.0)  # a clock that is set back
+    meter.add(FuelRate("fuel", ns(1.0), 36.0), 2.0)  # clock set back
     assert math.isnan(meter.take(ns(1.1)))

@@ -1,4 +1,4 @@
-"""What hinders an agent: the worst first, each in one sentence; what is missing is sure in the readings' own time."""
+"""An agent's problems: worst first, one sentence each; missing data by the readings' time."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ SPOOL = {"depth": 0, "pending": 0, "dropped": 0, "given_up": 0, "unsaved": 0}
 
 
 def report(pipeline: Pipeline, **known: Any) -> dict[str, Any]:
-    """As an agent has it that nothing else hinders."""
+    """For an agent without other problems."""
     parts = {"driver_problems": [], "spool_problem": "", "spool_damage": "", "calibration_problem": "", "silent_s": 0.0}
     rest = {"corrections": None, "record": None, "uplink": {"problem": ""}, "spool": SPOOL, "acknowledged": 0}
     return {**parts, **rest, "pipeline": pipeline.health(), "clocks": pipeline.clocks(), **known}
 
 
 def followed(readings: list[Reading], config: PipelineConfig | None = None) -> tuple[Pipeline, Status, list[str]]:
-    """After a stream of readings; and all that was said of missing samples."""
+    """After a stream of readings, with all sentences on missing samples."""
     pipeline, status = Pipeline(SITE, VEHICLE, config or PipelineConfig(LocalisationConfig("ekf"))), Status(VEHICLE)
     sentences: list[str] = []
     for i in range(0, len(readings), 15):
@@ -60,7 +60,7 @@ def without(*kinds: str, readings: list[Reading] = DRIVEN) -> list[Reading]:
 
 @cache
 def followed_without(*kinds: str) -> tuple[Pipeline, Status]:
-    """After the drive; a test changes neither."""
+    """After the drive; not changed by tests."""
     return followed(without(*kinds))[:2]
 
 
@@ -118,7 +118,7 @@ WAITING = SPOOL | {"depth": 312}
     ("kinds", "known", "sentence", "problems"),
     [
         ((), {}, "calibrating: drive a closed loop, or reverse over your own track", []),
-        (("torque",), {}, LACKS, [LACKS]),  # the machine has one, and it is silent
+        (("torque",), {}, LACKS, [LACKS]),  # a silent torque sensor
         (("imu",), {}, "no accelerations: track only", ["no accelerations: track only"]),
         ((), {"silent_s": SILENT_S + 1}, "no readings for 11 s: is the machine off?", []),
         ((), {"silent_s": SILENT_S + 1, "driver_problems": ["tty: unplugged"]}, "tty: unplugged", ["tty: unplugged"]),
@@ -158,7 +158,7 @@ def test_nothing_is_said_of_a_machine_that_has_all_nor_before_the_time():
     ("scale", "std", "looks"), [(0.1, 0.02, "10 % too high"), (-0.2, 0.05, "20 % too low"), (0.1, 0.04, "")]
 )
 def test_torque_by_an_engine_is_torque_and_a_reference_that_is_wrong_is_one_sentence(scale, std, looks: str):
-    """A machine on CAN has no torque at the wheels, and lacks nothing."""
+    """A machine on CAN without wheel torque lacks nothing."""
     pipeline, status, _ = followed(without("torque"))
     on_bus = replace(
         VEHICLE, powertrain=PowertrainConfig(2000.0), sensors=(*VEHICLE.sensors, SensorConfig("engine", "engine"))

@@ -27,13 +27,13 @@ ACCEPT, REFUSE, RESTART = Decision.ACCEPT, Decision.REFUSE, Decision.RESTART
     [
         ([(1, "a", ACCEPT), (20, "a", ACCEPT), (5000, "a", ACCEPT), (9999, "a", ACCEPT)], {}),
         ([(0, "a", REFUSE), (0, "b", ACCEPT)], {"reading_duplicate": 1}),
-        ([(100, "a", ACCEPT), (99, "a", REFUSE)], {"reading_late": 1}),  # a sensor's own never go back
+        ([(100, "a", ACCEPT), (99, "a", REFUSE)], {"reading_late": 1}),  # one sensor's stamps never go back
         ([(1000, "a", ACCEPT), (499, "b", REFUSE), (500, "b", ACCEPT), (400, "c", REFUSE)], {"reading_late": 2}),
         (
             [*((ms, "a", ACCEPT) for ms in (3000, 4000, 5000)), (10_001, "a", REFUSE), (11_002, "a", RESTART)],
-            {"gap_restarts": 1, "reading_ahead": 1},  # once the clock has gone on for a second
+            {"gap_restarts": 1, "reading_ahead": 1},  # after a second of the new clock
         ),
-        ([*((ms, "b", ACCEPT) for ms in range(100, 9000, 100)), (9000, "a", ACCEPT)], {}),  # a pause is one of all
+        ([*((ms, "b", ACCEPT) for ms in range(100, 9000, 100)), (9000, "a", ACCEPT)], {}),  # a pause concerns all
     ],
 )
 def test_what_is_accepted(order: StreamOrder, rows: list[tuple[int, str, Decision]], counters: dict[str, int]) -> None:
@@ -58,7 +58,7 @@ def test_late_sensor_among_punctual_ones_never_restarts(order: StreamOrder) -> N
     assert "clock_back_restarts" not in order.counters
 
 
-# --- what belongs to one time ----------------------------------------------------------------------------------------
+# --- equal stamps ----------------------------------------------------------------------------------------------------
 
 
 def gathered(order: StreamOrder, readings: list[Reading]) -> list[list[Reading]]:
@@ -72,7 +72,7 @@ def test_readings_of_a_time_are_held_until_one_of_another_time_comes() -> None:
 
 
 def test_one_reading_of_a_sensor_is_held_and_a_second_is_counted() -> None:
-    """A clock that stands still fills no memory."""
+    """A stopped clock fills no memory."""
     order = StreamOrder()
     assert gathered(order, [at(0), *[at(0)] * 1000, at(10)]) == [[at(0)], [at(10)]]
     assert order.counters == {"reading_duplicate": 1000}

@@ -1,6 +1,6 @@
-"""Wheels that die, hang, slip or have the wrong sign, machines that are carried: named, left out, and used again.
+"""Dead, frozen, slipping or reversed wheels, carried machines: named, excluded, used again.
 
-Each drive is made up, with a slow and a white error of the receiver; each fault is judged beside the drive without it.
+Synthetic drives with slow and white receiver errors; each fault is compared with the faultless drive.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from tests.unit.agents.test_receiver_faults import measured as usual_drive
 
 pytestmark = pytest.mark.slow
 SEED = 1
-STOP_S, REVERSE_S = 74.0, 82.0  # when the machine stands, and backs up
+STOP_S, REVERSE_S = 74.0, 82.0  # of standstill and reversing
 GPS = SensorConfig("gps-1", "gps", Mount(LEVER_M), drift_share=SLOW_SHARE, drift_time_s=SLOW_S)
 IMU = SensorConfig("imu", "imu")
 LEFT, RIGHT = (
@@ -39,7 +39,7 @@ LEFT, RIGHT = (
 )
 ODOMETRY = SensorConfig("wheels", "odometry", measures=("speed",))
 ENCODER = SensorConfig("wheels", "encoder")
-Read = Callable[[float, float], float]  # seconds and a true speed -> what the sensor shows
+Read = Callable[[float, float], float]  # seconds, true speed -> reading
 
 
 def legs(speed_mps: float) -> tuple[Leg, ...]:
@@ -60,7 +60,7 @@ def truth(speed_mps: float) -> Drive:
 
 @dataclass(frozen=True)
 class Case:
-    """What wheel sensors read. ends_s: when they are right again; begin_s: from when on what is named can be seen."""
+    """Wheel readings. ends_s: right again; begin_s: fault visible."""
 
     expected: Fault
     read: Read
@@ -68,7 +68,7 @@ class Case:
     wheels: tuple[SensorConfig, ...] = (ODOMETRY,)
     speed_mps: float = 3.0
     ends_s: float = math.inf
-    half: bool = False  # one channel of an encoder alone
+    half: bool = False  # one encoder channel
 
 
 def stands(begin_s: float, end_s: float = math.inf) -> Read:
@@ -104,7 +104,7 @@ AT_NIGHT = ("carried", "dead, encoder, recovers", "one of two dead", "unsigned")
 
 @cache
 def unmoved(speed_mps: float, seed: int) -> list[Reading]:
-    """Readings of the drive but those of wheels; a quarter of the fast ones are enough here, and save time."""
+    """All readings but wheels; a quarter of the fast ones, to save time."""
     rng, slow_m, kept = np.random.default_rng(seed), math.sqrt(SLOW_SHARE) * STD_M, math.exp(-0.2 / SLOW_S)
     error, readings = slow_m * rng.standard_normal(2), []
     for r in noisy(thinned(truth(speed_mps).readings, 40), seed):
@@ -123,7 +123,7 @@ def shown(case: Case, seed: int = SEED) -> list[Reading]:
 
 
 def rolled(case: Case, made: Drive, sensor: SensorConfig, *, faulty: bool) -> list[Reading]:
-    """What one wheel sensor reads, 20 times a second."""
+    """One wheel sensor's readings at 20 Hz."""
     speeds = made.speed_mps - sensor.mount.xyz_m[1] * np.gradient(made.heading_rad, 0.01)
     times_s = np.arange(1, len(speeds) + 1) * 0.01
     wrong = np.array([case.read(s, v) for s, v in zip(times_s.tolist(), speeds.tolist(), strict=True)])
@@ -137,7 +137,7 @@ def rolled(case: Case, made: Drive, sensor: SensorConfig, *, faulty: bool) -> li
 
 
 def verdicts(vehicle: MachineConfig, readings: Sequence[Reading]) -> list[tuple[float, dict[str, str]]]:
-    """What the judge says, whenever that changes: seconds since the begin, and a sentence by sensor."""
+    """Changes of verdict: seconds since the start, sentence by sensor."""
     judge, reckoned = WheelJudge(vehicle, PROJECTION), DeadReckoning(vehicle, 0.0)
     said: list[tuple[float, dict[str, str]]] = [(0.0, {})]
     for _, same in groupby(sorted(readings, key=lambda r: r.stamp_ns), key=lambda r: r.stamp_ns):
@@ -161,7 +161,7 @@ def test_a_fault_is_named_within_ten_seconds_and_until_it_ends(name: str) -> Non
 
 @dataclass(frozen=True)
 class Outcome:
-    """Errors [m] and their normalised squares of live poses (n,), their times [s]; what health says at the end."""
+    """Live poses: errors [m], normalised squares (n,), times [s]; final health."""
 
     seconds: Floats
     off_m: Floats
@@ -202,7 +202,7 @@ def test_positions_are_nearly_as_good_as_without_the_fault(name: str) -> None:
     assert without.faults == {}
 
 
-SOUND: dict[str, tuple[Read, tuple[SensorConfig, ...]]] = {  # what wheels do without a fault
+SOUND: dict[str, tuple[Read, tuple[SensorConfig, ...]]] = {  # faultless wheels
     "passing": (sound, (ODOMETRY,)),
     "passing, encoder": (sound, (ENCODER,)),
     "passing, two": (sound, (LEFT, RIGHT)),

@@ -1,4 +1,4 @@
-"""A machine without wheels, or whose wheels fall silent: speed over ground by GPS stands in for them."""
+"""Machines with no or silent wheels: GPS speed over ground instead."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ FIX_STD_M, DOPPLER_STD_MPS = 0.5, 0.1
 
 
 def equipped(*kinds: str) -> MachineConfig:
-    """The machine with sensors of these kinds alone."""
+    """The machine with these sensor kinds only."""
     return replace(VEHICLE, sensors=tuple(s for s in (*VEHICLE.sensors, DOPPLER) if s.kind in kinds))
 
 
 def sensed(made: Drive, vehicle: MachineConfig, seed: int = 1) -> list[Reading]:
-    """Readings of these sensors with noise and biases: Doppler at 2 Hz, IMU at 50 Hz."""
+    """Noisy, biased readings: Doppler 2 Hz, IMU 50 Hz."""
     rng, sees = np.random.default_rng(seed), {s.kind for s in vehicle.sensors}
     readings: list[Reading] = doppler(made, rng) if DOPPLER.kind in sees else []
     for i, reading in enumerate(r for r in made.readings if r.kind in sees):
@@ -70,7 +70,7 @@ def doppler(made: Drive, rng: np.random.Generator) -> list[Reading]:
 
 @dataclass(frozen=True)
 class Errors:
-    """Of poses ten times a second: stamps [s], distance [m], heading [rad], and whether the 95 % ellipse holds."""
+    """Poses at 10 Hz: stamps [s], distance [m], heading [rad], inside the 95 % ellipse."""
 
     seconds: Floats
     off_m: Floats
@@ -142,7 +142,7 @@ def test_wheels_that_fall_silent_for_a_while_leave_a_good_pose() -> None:
     assert rms(errors.off_m[silent]) < 0.6
     assert errors.holds[silent].mean() > 0.9
     assert abs(errors.heading_rad).max() < 0.1
-    assert core.counters["wheels_gated"] == 0  # they fit when they are back
+    assert core.counters["wheels_gated"] == 0  # consistent on return
     driven_m = float(np.abs(made.speed_mps).sum() * 0.01)
     assert core.dead_reckoning.distance_m == pytest.approx(driven_m, rel=0.05)
 
@@ -211,7 +211,7 @@ def place(seconds: float, east_m: float, std: float = 0.5) -> Gps:
 
 
 def test_the_speed_is_that_of_base_link_and_has_its_sign() -> None:
-    """The antenna, 2 m ahead, moves sideways in a bend; the machine drives north, then reverses."""
+    """In a bend the antenna, 2 m ahead, moves sideways; the machine drives north, then reverses."""
     tracker, sensor = GroundTracker(turns=True), replace(DOPPLER, mount=Mount((2.0, 0.0, 3.0)))
     still = tracker.update(velocity(-1, 0.0, 0.1), sensor, 0.0)
     assert still
@@ -241,7 +241,7 @@ def test_the_first_motion_is_ahead_unless_wheels_say_otherwise() -> None:
 
 def test_fixes_make_a_speed_once_they_are_further_apart_than_by_noise_and_repeats_make_none() -> None:
     tracker, gps = GroundTracker(turns=True), SensorConfig("gps", "gps")
-    held = [place(0.2 * i, 2.0 * (0.2 * (i // 5 * 5))) for i in range(40)]  # a new place once a second
+    held = [place(0.2 * i, 2.0 * (0.2 * (i // 5 * 5))) for i in range(40)]  # a new place each second
     shown = [speed for fix in held if (speed := tracker.update(fix, gps, 0.0))]
     assert [speed.speed_mps for speed in shown] == pytest.approx([2.0] * len(shown), rel=0.01)
     assert len(shown) >= 2

@@ -1,4 +1,4 @@
-"""A caster, or a base on a port of TCP, on loopback: what it does with each connection is up to the test."""
+"""A caster or TCP base on loopback; each test chooses its behaviour."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Serve = Callable[[socket.socket], None]
 
 
 class Caster:
-    """Serves every connection by `serve`, after the request has come, which it keeps; killed, it hangs up on all."""
+    """Keeps each request, then runs `serve` on the connection."""
 
     def __init__(self, serve: Serve, *, port: int = 0, asks: bool = True, tls: ssl.SSLContext | None = None) -> None:
         self.requests: list[str] = []
@@ -61,7 +61,7 @@ class Caster:
 
 
 def sends(*pieces: bytes, stays: bool = True) -> Serve:
-    """Send these, and then wait until the other side hangs up, or hang up."""
+    """Send, then wait for the other side's end, or hang up."""
 
     def serve(link: socket.socket) -> None:
         for piece in pieces:
@@ -73,7 +73,7 @@ def sends(*pieces: bytes, stays: bool = True) -> Serve:
 
 
 def floods(piece: bytes, first: bytes = b"") -> Serve:
-    """Send one thing without end."""
+    """Send one piece forever."""
 
     def serve(link: socket.socket) -> None:
         link.sendall(first)

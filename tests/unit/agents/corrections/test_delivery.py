@@ -1,4 +1,4 @@
-"""Corrections at a machine: what reaches its receivers' ports, through Zenoh, and what is said where nothing does."""
+"""Corrections at a machine, over Zenoh to the receivers' ports, and the sentences on failure."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def session() -> Iterator[Any]:
 
 
 class Receiver:
-    """A receiver's port of TCP, which may be unplugged."""
+    """A receiver's TCP port that can be unplugged."""
 
     def __init__(self, port: int = 0) -> None:
         self.heard = b""
@@ -57,7 +57,7 @@ class Receiver:
         self.address = f"tcp://127.0.0.1:{self.caster.port}"
 
     def _serve(self, link: socket.socket) -> None:
-        link.sendall(b"$GPGGA,\r\n" * 100)  # which nobody reads
+        link.sendall(b"$GPGGA,\r\n" * 100)  # nobody reads it
         while data := link.recv(4096):
             self.heard += data
 
@@ -109,7 +109,7 @@ def test_a_receiver_that_is_unplugged_is_named_and_gets_the_next_ones_when_it_is
         receiver.caster.kill()
 
         def is_noticed() -> bool:
-            session.put(key, said)  # the first may still go into the socket's buffer
+            session.put(key, said)  # the first may still fit the socket's buffer
             return "corrections do not reach tcp://" in delivery.report()["problem"]
 
         until(is_noticed, "the receiver missed")
@@ -137,7 +137,7 @@ def test_the_port_that_a_driver_reads_takes_corrections_too(session: Any) -> Non
     [
         (encode_corrections(replace(SAID, frames=SAID.frames[:-1])), "refused_crc"),
         (encode_corrections(replace(SAID, frames=SAID.frames + b"$")), "refused_crc"),
-        (encode_corrections(replace(SAID, frames=b"\xb5\x62\x06\x04\x04\x00")), "refused_crc"),  # a command to a u-blox
+        (encode_corrections(replace(SAID, frames=b"\xb5\x62\x06\x04\x04\x00")), "refused_crc"),  # a u-blox command
         (encode_corrections(replace(SAID, base="base-2")), "refused_out_of_range"),
         (b"\xff", "refused_not_msgpack"),
         (bytes(70_000), "refused_too_large"),
@@ -155,7 +155,7 @@ def test_nothing_but_whole_frames_of_its_base_reaches_a_receiver(session: Any, p
 
 
 def test_a_port_that_takes_little_at_a_time_gets_all_and_one_that_takes_nothing_is_named(session: Any) -> None:
-    frames = b"".join(FRAMES) * 5000  # more than any buffer holds
+    frames = b"".join(FRAMES) * 5000  # beyond any buffer
     receiver = Receiver()
     with receiver.caster:
         port = OwnPort(receiver.address, 9600)
@@ -194,11 +194,11 @@ def test_a_port_that_hangs_costs_old_messages_alone(session: Any) -> None:
     assert delivery.report()["counters"] == {"frames": (1 + WAITING) * len(FRAMES)}
 
 
-# --- what is said ----------------------------------------------------------------------------------------------------
+# --- sentences --------------------------------------------------------------------------------------------------------
 
 
 def after(*messages: tuple[float, float, str | None], state: CorrectionsState | None = None) -> CorrectionsState:
-    """The state after messages: their stamp, when they came, and their problem, None for frames."""
+    """State after messages: stamp, arrival, problem (None: frames)."""
     state = state or CorrectionsState("base-1", 0)
     for stamp_s, came_s, problem in messages:
         frames = SAID.frames if problem is None else b""

@@ -1,4 +1,4 @@
-"""The relay at a caster: over a real socket, with both versions of the protocol, refusals, and a caster that dies."""
+"""The relay at a caster over real sockets: both protocol versions, refusals, a dying caster."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def chunked(data: bytes, size: int) -> bytes:
 
 
 class Running:
-    """A relay of the caster on a port, step by step; `waits`: between tries to reach it."""
+    """A relay, step by step; `waits`: pauses before reconnecting."""
 
     def __init__(self, port: int, scheme: str = "ntrip", host: str = "127.0.0.1") -> None:
         self.said: list[Corrections] = []
@@ -233,7 +233,7 @@ def test_a_relay_that_cannot_be_is_refused(options: dict[str, str], problem: str
 
 
 def _certificate(folder: Path) -> Path:
-    """Key and certificate of `localhost`, in one file."""
+    """Key and certificate of `localhost`, one file."""
     pytest.importorskip("cryptography")
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization

@@ -1,4 +1,4 @@
-"""RTCM3 out of bytes: every whole frame, whatever is around it, as pyrtcm frames it."""
+"""RTCM3 framing: every whole frame from any stream, as pyrtcm does it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def frame(rng: random.Random, size: int | None = None) -> bytes:
 
 
 def garbage(rng: random.Random) -> bytes:
-    """Noise, heads that promise a frame, text, and frames that are cut or have one bit flipped."""
+    """Noise, false heads, text, cut frames, frames with a bit flipped."""
     spoiled = bytearray(frame(rng))
     spoiled[rng.randrange(len(spoiled))] ^= 1 << rng.randrange(8)
     cut = frame(rng)[: rng.randrange(6)]

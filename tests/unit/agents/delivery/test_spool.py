@@ -36,19 +36,19 @@ def spool(tmp_path: Path) -> Iterator[Spool]:
 
 
 def kill(spool: Spool) -> None:
-    """End the process that has it open."""
+    """End its process."""
     spool._db.close()
 
 
 def changed(path: Path, statement: str) -> Path:
-    """The folder of a spool at rest, in whose file a statement was carried out."""
+    """The folder of a closed spool, its file changed by a statement."""
     with contextlib.closing(sqlite3.connect(path / "spool.db")) as db, db:
         db.execute(statement)
     return path
 
 
 def quarantined(path: Path) -> list[tuple[int, bytes, str]]:
-    """Number, sample and problem of what a spool at rest has in quarantine."""
+    """Number, sample and problem of a closed spool's quarantine."""
     with contextlib.closing(sqlite3.connect(path / "spool.db")) as db:
         return db.execute("SELECT seq, row, problem FROM quarantine ORDER BY seq").fetchall()
 
@@ -160,7 +160,7 @@ def test_no_sample_is_final_before_an_earlier_one(spool: Spool, n: int, pending:
 
 
 def test_pending_samples_that_a_copy_of_the_file_has_delivered_are_passed_over(tmp_path: Path) -> None:
-    """Whoever opens a copy takes them as they are, and sends them under the numbers that they have here."""
+    """They are sent as they are, under this spool's numbers."""
     spool = opened(tmp_path, 2, AuditLog(tmp_path / "audit"))
     spool.record(ROWS[:6], pending=6)
     spool.acknowledge(spool.spool_id, 4)
@@ -178,7 +178,7 @@ def test_pending_samples_that_a_copy_of_the_file_has_delivered_are_passed_over(t
 
 @pytest.mark.parametrize("limit", [1, 3])
 def test_full_spool_drops_no_pending_sample(tmp_path: Path, limit: int) -> None:
-    """They do not count: else a spool that holds less than the lag would drop each sample before it may be sent."""
+    """Pending samples do not count: a spool below the lag would drop each before its final value."""
     spool = opened(tmp_path, limit)
     spool.record(ROWS[:10], pending=10)
     assert (spool.counters()["depth"], spool.counters()["dropped"]) == (10, 0)
@@ -190,7 +190,7 @@ def test_full_spool_drops_no_pending_sample(tmp_path: Path, limit: int) -> None:
     spool.close()
 
 
-# --- holes, bounds, and samples that the server refuses --------------------------------------------------------------
+# --- holes, bounds, refused samples ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("limit", [1, 10])
@@ -251,7 +251,7 @@ def unreadable(folder: Path, damage: bytes) -> Path:
     ],
 )
 def test_a_file_that_is_not_what_was_written_is_a_store_error(tmp_path: Path, damage: Any, problem: str) -> None:
-    """Rather than a reason to send under another identity."""
+    """Never a reason for another identity."""
     spool = opened(tmp_path)
     spool.record(ROWS[:3])
     spool.close()
@@ -260,7 +260,7 @@ def test_a_file_that_is_not_what_was_written_is_a_store_error(tmp_path: Path, da
 
 
 class FullDisk(sqlite3.Connection):
-    """A disk that is full when it comes to some statement; SQLite rolls back by itself, or does not."""
+    """A disk full at some statement; SQLite rolls back itself, or not."""
 
     rolls_back = False
     full_at = "never"
@@ -327,7 +327,7 @@ def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop
     spool.close()
 
 
-# --- the audit --------------------------------------------------------------------------------------------------------
+# --- the audit -------------------------------------------------------------------------------------------------------
 
 HASHES = [content_hash(row) for row in ROWS]
 
@@ -353,7 +353,7 @@ def test_what_a_crash_kept_from_being_noted_is_added(path: Path) -> None:
 
 
 def test_sample_that_is_on_disk_with_another_content_is_noted_so(path: Path) -> None:
-    """Its final value was not noted, or is gone with a damaged log; who knows which of the two has been delivered?"""
+    """Its final value was not noted, or the log is damaged: which of the two was delivered is unknown."""
     audit = AuditLog(path)
     audit.recorded(7, 1, ROWS[:3])
     for _ in range(2):
@@ -409,7 +409,7 @@ def test_audit_on_a_full_disk_keeps_no_sample_from_the_spool(tmp_path: Path, pat
     assert read_audit(path) == numbered(5, 1, HASHES[:2])
 
 
-# --- what waits for the disk ------------------------------------------------------------------------------------------
+# --- the write buffer ------------------------------------------------------------------------------------------------
 
 MANY = made_up_samples(400)
 BETTER = better(MANY)
@@ -422,7 +422,7 @@ def sendable(spool: Spool) -> bytes:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_whatever_the_disk_does_each_sample_gets_its_own_final_value(tmp_path: Path, seed: int) -> None:
-    """New samples, final values, writes and full disks in any order, against a list."""
+    """Random samples, final values, writes and full disks against a list."""
     rng, buffer = random.Random(seed), WriteBuffer()
     spool = Spool(tmp_path / "spool.db", SpoolConfig())
     made = final = 0

@@ -1,4 +1,4 @@
-"""What a machine's disk has lost of its spool is named, counted, and declared to the server."""
+"""Samples lost by a machine's disk are named, counted and declared to the server."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def opened(folder: Path) -> Spool:
 
 
 def left_by_kill(work: Path, left: Path, use: Callable[[Spool], object]) -> Path:
-    """Use a spool in `work`, and copy its files to `left` before it is closed: as kill -9 leaves them."""
+    """Use a spool in `work` and copy its files to `left` before closing, as after kill -9."""
     with closing(opened(work)) as spool:
         use(spool)
         shutil.copytree(work, left)
@@ -37,7 +37,7 @@ def record(spool: Spool) -> None:
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """400 recorded samples, none of them sent."""
+    """400 recorded samples, none sent."""
     folder = tmp_path_factory.mktemp("spools")
     return left_by_kill(folder / "work", folder / "left", record)
 
@@ -53,7 +53,7 @@ def cut_short(folder: Path, share: float) -> None:
 
 
 def deliver(spool: Spool) -> tuple[list[str], int, int]:
-    """Send everything to a new server; returns what it takes, what it counts as lost, and the last watermark."""
+    """Send everything to a new server: accepted, number declared lost, last watermark."""
     taken: list[str] = []
     lost, marks = 0, dict[int, int]()
     while head := spool.head(1000):
@@ -95,7 +95,7 @@ def test_each_flip_in_the_log_is_named_counted_and_declared_to_the_server(killed
 
 
 def test_what_is_gone_is_counted_once_and_kept(folder):
-    cut_short(folder, 0.45)  # in the middle of a transaction: pages are there that nobody can use
+    cut_short(folder, 0.45)  # amid a transaction: with orphaned pages
     with closing(opened(folder)) as spool:
         gone = spool.counters()["gone"]
         assert 100 < gone < 300
@@ -106,7 +106,7 @@ def test_what_is_gone_is_counted_once_and_kept(folder):
 
 
 def test_runs_that_are_gone_with_the_log_are_declared_too(tmp_path):
-    """Two kills without a checkpoint: the log has two runs."""
+    """Two kills without a checkpoint: two runs in the log."""
 
     def again(spool: Spool) -> None:
         spool.record(ROWS[300:])
@@ -136,7 +136,7 @@ def test_what_was_acknowledged_is_not_gone(tmp_path):
 
 
 def test_a_copy_in_place_of_the_file_is_named_and_declares_nothing(tmp_path):
-    """The other file may still be sent: what it alone has must not be declared lost."""
+    """The other file may still be sent, so its samples must not be declared lost."""
     with closing(opened(tmp_path)) as spool:
         spool.record(ROWS[:20])
     shutil.copy(tmp_path / "spool.db", tmp_path / "copy.db")

@@ -28,14 +28,14 @@ from protocol.wire.messages import Ack, Refused, SampleBatch
 from tests.unit.agents.drives import SITE, made_up_samples
 
 ROWS = made_up_samples(500)
-QUICK_S = 0.01  # an exchange over a good link
+QUICK_S = 0.01  # exchange on a good link
 TIMEOUT_S = UplinkConfig().timeout_s
 
 
 class Delivery:
-    """An uplink and its spool; the actions between them are carried out, what is sent and replied is up to a test."""
+    """An uplink and its spool with their actions carried out; the test is the network and the server."""
 
-    folder: Path  # of the test, for spools
+    folder: Path  # for spools
     _names = itertools.count()
 
     def __init__(self, n: int = 0, spool: Spool | None = None, max_samples: int = 10_000, **pacing: Any) -> None:
@@ -46,7 +46,7 @@ class Delivery:
         self.uplink = Uplink("loader-1", SITE.frame, TIMEOUT_S, Pacing(**pacing), np.random.default_rng(0))
 
     def payload(self) -> bytes | None:
-        """What is sent next; None if the uplink waits for samples."""
+        """The next payload; None if waiting for samples."""
         action = self._until(self.uplink.start_exchange())
         assert isinstance(action, Send) or action.for_samples
         return action.payload if isinstance(action, Send) else None
@@ -56,7 +56,7 @@ class Delivery:
         return decode_batch(payload, 1e9)
 
     def reply(self, reply: Ack | Refused | None, took_s: float | None = None) -> float:
-        """Hand in the answer to the last payload, at once, or none within the time-out; returns the pause."""
+        """Answer the last payload, at once or (None) by time-out; returns the pause."""
         took_s = took_s or (TIMEOUT_S if reply is None else QUICK_S)
         action = self._until(self.uplink.on_reply(reply, took_s))
         assert isinstance(action, Wait)
@@ -80,7 +80,7 @@ def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def met(n: int = 0, **options: Any) -> Delivery:
-    """An uplink that the server has answered once."""
+    """An uplink after the server's first answer."""
     delivery = Delivery(**options)
     assert delivery.payload()
     assert delivery.reply(Ack(0, 0)) == 0
@@ -114,7 +114,7 @@ def test_batch_is_halved_on_a_time_out_and_doubled_on_success() -> None:
 
 @pytest.mark.parametrize(("asked_s", "least_s"), [(0.3, 0.3), (4.0, 4.0), (3000.0, 5.0)])
 def test_a_machine_comes_again_when_the_server_has_room_and_not_all_at_once(asked_s: float, least_s: float) -> None:
-    """As often as it is asked to, and never much later than by itself."""
+    """As often as asked, never much later than by itself."""
     d = met(5, max_backoff_s=5.0)
     pauses = []
     for _ in range(50):
@@ -123,7 +123,7 @@ def test_a_machine_comes_again_when_the_server_has_room_and_not_all_at_once(aske
     assert least_s <= min(pauses) < 1.1 * least_s
     assert 1.4 * least_s < max(pauses) <= 1.5 * least_s
     d.payload()
-    assert d.reply(None) <= 0.2  # which has nothing to do with failures
+    assert d.reply(None) <= 0.2  # independent of failures
     assert d.counter("depth") == 5
 
 
@@ -136,7 +136,7 @@ def test_pause_doubles_up_to_its_bound_and_starts_anew_after_success(reply: Refu
         pauses.append(d.reply(reply))
     for pause, most in zip(pauses, (0.2, 0.4, 0.8, *[1.5] * 57), strict=True):
         assert most / 2 <= pause <= most
-    assert max(pauses) - min(pauses[3:]) > 0.6  # those of a fleet spread
+    assert max(pauses) - min(pauses[3:]) > 0.6  # a fleet's are spread
     d.batch()
     d.reply(Ack(5, 1))
     d.spool.record(ROWS[5:6])
@@ -163,7 +163,7 @@ def test_missing_server_leaves_the_batch_as_it_is() -> None:
     [(300e3, 0.3, 0.2), (30e3, 0.1, 0.1), (300e3, 1.6, 0.0)],
 )
 def test_batch_fits_the_link(rate_bps: float, delay_s: float, jitter_s: float) -> None:
-    """The link is used well, an exchange takes about a third of the time-out, and few run into it."""
+    """Good use of the link, exchanges of about a third of the time-out, few time-outs."""
     rng = np.random.default_rng(1)
     d = met(max_samples=100_000)
     d.spool.record(made_up_samples(60_000))
@@ -179,14 +179,14 @@ def test_batch_fits_the_link(rate_bps: float, delay_s: float, jitter_s: float) -
             now_s += TIMEOUT_S + d.reply(None)
     late = took[len(took) // 2 :]
     assert d.uplink.counters["timeouts"] <= 3
-    # Smaller batches would not help where the delay alone takes that long, nor where the first one is small already.
+    # Smaller batches would not help where the delay alone takes as long or the first batch is small.
     assert np.median(late) < max(1.2, 1.2 * delay_s + 0.5) if rate_bps > 100e3 else max(late) < TIMEOUT_S
     share = sent * SAMPLE_DTYPE.itemsize * 8 / rate_bps / now_s
     assert sent == 60_000 or share > (0.6 if delay_s < 0.2 else 0.15)
 
 
 def test_server_that_lost_samples_is_told_so() -> None:
-    """It was restored from a backup after this agent had met it."""
+    """It was restored from a backup."""
     d = met(20, first_batch=5, max_batch=5)
     d.reply(Ack(d.batch().last_seq, 1))
     assert d.batch().first_seq == 6
@@ -243,7 +243,7 @@ def test_what_is_no_sample_s_fault_quarantines_nothing(reason: Refusal) -> None:
 
 
 def test_numbers_that_somebody_else_has_used_move_to_a_new_identity() -> None:
-    """A virtual machine that was set back while it ran: the server knows more of this run than the run itself."""
+    """A virtual machine set back while running: the server knows more of the run than itself."""
     d = met(5)
     d.reply(Ack(d.batch().last_seq, 1))
     old = d.spool.spool_id
@@ -258,7 +258,7 @@ def test_numbers_that_somebody_else_has_used_move_to_a_new_identity() -> None:
 
 
 def reopened(tmp_path: Path, n: int = 0, acknowledged: int = 0) -> tuple[Delivery, int]:
-    """An uplink whose spool had a run before: of n samples, some acknowledged; and that run's identity."""
+    """An uplink after an earlier run of n samples, some acknowledged; the run's identity."""
     spool = Spool(tmp_path / "spool.db", SpoolConfig())
     earlier = spool.spool_id
     spool.record(ROWS[:n])
@@ -269,7 +269,7 @@ def reopened(tmp_path: Path, n: int = 0, acknowledged: int = 0) -> tuple[Deliver
 
 @pytest.mark.parametrize("watermark", [0, 5, 9])
 def test_run_that_is_delivered_is_closed_with_one_empty_batch(tmp_path: Path, watermark: int) -> None:
-    """A server that was restored from a backup learns so what it has lost; one that knows it all changes nothing."""
+    """A restored server learns its loss; a complete one changes nothing."""
     d, earlier = reopened(tmp_path, 5, acknowledged=5)
     batch = d.batch()
     assert (batch.spool_id, batch.first_seq, len(batch.rows), batch.lost_before) == (earlier, 6, 0, 5)
@@ -287,7 +287,7 @@ def test_run_that_is_delivered_is_closed_with_one_empty_batch(tmp_path: Path, wa
 def test_runs_are_closed_again_when_the_journal_has_lost_rows(
     tmp_path: Path, row: int, trimmed: int, again: bool
 ) -> None:
-    """The server was struck after the earlier run was closed, and before it had a sample of this one."""
+    """The fault was after the earlier run's closing, before this run's first sample."""
     d, earlier = reopened(tmp_path, 5, acknowledged=5)
     d.batch()
     d.reply(Ack(5, 7, 0, FIRST))
@@ -330,9 +330,9 @@ FIRST, SECOND = "a" * 16, "b" * 16
 
 
 def bound_to_first(n: int = 8) -> Delivery:
-    """An uplink of whose run the store FIRST has acknowledged five samples, of n."""
+    """An uplink with five of n samples acknowledged by the store FIRST."""
     d = met(n, first_batch=5)
-    assert d.batch().store == ""  # nothing was acknowledged yet: any store may
+    assert d.batch().store == ""  # nothing acknowledged yet: any store
     d.reply(Ack(5, 1, store=FIRST))
     return d
 
@@ -345,7 +345,7 @@ def test_nothing_is_deleted_on_the_word_of_another_store(store: str):
     assert d.counter("depth") == 3
     assert FIRST in d.uplink.problem
     assert d.uplink.counters["other_store"] == 1
-    assert d.batch().first_seq == 6  # it sends the same again, until a server with the right store answers
+    assert d.batch().first_seq == 6  # the same again, until the right store answers
     d.reply(Ack(8, 2, store=FIRST))
     assert (d.counter("depth"), d.uplink.problem) == (0, "")
 
@@ -353,7 +353,7 @@ def test_nothing_is_deleted_on_the_word_of_another_store(store: str):
 def test_a_store_that_replaces_another_learns_what_it_lacks():
     d = bound_to_first()
     d.batch()
-    d.reply(Refused(Refusal.GAP, "", expected=1))  # it is accepted, and has nothing of the run
+    d.reply(Refused(Refusal.GAP, "", expected=1))  # accepted: it has none of the run
     sent = d.batch()
     assert (sent.first_seq, sent.lost_before, sent.store) == (6, 5, FIRST)
     d.reply(Ack(8, 1, store=SECOND, replaces=FIRST))
@@ -371,5 +371,5 @@ def test_an_offer_is_kept_from_an_acknowledgement_that_is_believed() -> None:
     delivery.reply(Ack(2, 2, store=FIRST))
     assert delivery.uplink.offer == {"zero": 0.004}
     delivery.payload()
-    delivery.reply(Ack(3, 3, store="f" * 16, offer={"zero": 0.1}))  # of a store that the run is not bound to
+    delivery.reply(Ack(3, 3, store="f" * 16, offer={"zero": 0.1}))  # the run is bound to another store
     assert delivery.uplink.offer == {"zero": 0.004}

@@ -1,4 +1,4 @@
-"""Bytes as receivers send them, by the simulator's writers, which oracles check; and a source of known values."""
+"""Receivers' bytes by the simulator's writers (checked against oracles), and a scripted source."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ TPV = {
 
 
 def report(values: dict[str, Any]) -> bytes:
-    """As gpsd sends it."""
+    """In gpsd's form."""
     return json.dumps(values, separators=(",", ":")).encode() + b"\r\n"
 
 
@@ -68,17 +68,16 @@ def ubx(name: str, **values: Any) -> bytes:
 
 
 def pvt(**values: int) -> bytes:
-    """NAV-PVT with other values, by the names of NavPvt."""
+    """NAV-PVT with changed fields of NavPvt."""
     return PVT._replace(**values).frame()
 
 
 def esf(tag: int, *data: tuple[int, int]) -> bytes:
-    """ESF-MEAS of these data types and their fields."""
     return esf_meas(tag, data)
 
 
 def spoiled(frames: list[bytes], seed: int = 1) -> tuple[bytes, int]:
-    """A stream of these frames with 16 % of them broken, and how many are not."""
+    """The frames as a stream with 16 % broken, and the number of whole ones."""
     draw, stream, whole = random.Random(seed), bytearray(), 0
     for i, frame in enumerate(frames):
         data = bytearray(frame)
@@ -92,7 +91,7 @@ def spoiled(frames: list[bytes], seed: int = 1) -> tuple[bytes, int]:
 
 
 def recording(name: str) -> Path:
-    """A recording of a real receiver, where it is at hand."""
+    """A real receiver's recording, or skip."""
     path = SHARED_DATA / "recordings" / name
     if not path.is_file():
         pytest.skip(f"the recording is not beside the project (../shared/data/recordings/{name})")
@@ -104,7 +103,7 @@ def no_bundles() -> Driver:
 
 
 class Script:
-    """A source that hands on these pieces."""
+    """A source of given pieces."""
 
     def __init__(self, pieces: Sequence[Sequence[Observed]]) -> None:
         self._pieces = list(pieces)

@@ -28,7 +28,7 @@ from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, changed_senso
 
 
 class Time:
-    """A clock that only moves when somebody waits."""
+    """A clock moved only by waiting."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -47,7 +47,7 @@ class Time:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seconds of driving, two of silence, one of driving."""
+    """Two seconds of driving, two silent, one of driving."""
     path = tmp_path_factory.mktemp("log")
     made = drive([Leg(5, 0.5)], VEHICLE)
     silent = (START_NS + 2 * 10**9, START_NS + 4 * 10**9)
@@ -56,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def replay(folder: Path, speed: float) -> tuple[list[Reading], list[float], Time, int]:
-    """All readings, the time at which each was handed on, and how many reads gave nothing."""
+    """All readings, their times of release, number of empty reads."""
     time_ = Time()
     driver = Replay(open_log(folder), speed, time_.clock, time_.wait)
     readings: list[Reading] = []
@@ -84,13 +84,13 @@ def test_replay_keeps_pace(folder: Path, speed: float) -> None:
     assert max(time_.waits) <= 0.2, "no longer than a read may take"
     due = [(r.stamp_ns - readings[0].stamp_ns) * 1e-9 / speed for r in readings]
     early = [d - a for d, a in zip(due, at, strict=True)]
-    assert max(early) <= 0.05 / speed + 1e-6  # at most what is handed on together
+    assert max(early) <= 0.05 / speed + 1e-6  # released together at most
     assert min(early) >= -1e-6
-    assert empty or speed > 1  # the silence is longer than a read may take
+    assert empty or speed > 1  # silence longer than a read's limit
 
 
 def test_replay_hands_on_readings_with_too_early_stamps_when_they_were_true(tmp_path: Path) -> None:
-    """And with the same pauses as if their stamps were right."""
+    """With the pauses of right stamps."""
     made = drive([Leg(3, 0.5)], VEHICLE).readings
     write_log(tmp_path / "right", "lot", SITE, VEHICLE, made)
     early = [replace(r, stamp_ns=r.stamp_ns - 700_000_000) if r.sensor == "gps-1" else r for r in made]
@@ -118,7 +118,7 @@ def test_replay_counts_rows_that_were_refused(folder: Path, tmp_path: Path) -> N
 
 @pytest.fixture(scope="module")
 def sessions() -> Iterator[tuple[Any, Any]]:
-    """A router in this process, and a client of it."""
+    """A router in this process and its client."""
     endpoint = free_endpoint()
     router: Any = open_session(SessionConfig(endpoint, mode="router"))
     client: Any = open_session(SessionConfig(endpoint))
@@ -128,7 +128,7 @@ def sessions() -> Iterator[tuple[Any, Any]]:
 
 
 class Stream:
-    """A driver, and what a machine sends to it."""
+    """A driver and its machine's messages."""
 
     def __init__(self, sessions: tuple[Any, Any], name: str) -> None:
         self.driver = ZenohDriver(sessions[1], SITE.name, name)
@@ -143,7 +143,7 @@ class Stream:
 
     def close(self) -> None:
         self.driver.close()
-        self._wait(False)  # else the next stream of this name takes this one's subscriber for its own
+        self._wait(False)  # else the next stream of the name mistakes this subscriber for its own
         self._publisher.undeclare()
 
     def _wait(self, known: bool) -> None:
@@ -208,7 +208,7 @@ def test_driver_hears_no_other_machine(sessions: tuple[Any, Any], stream: Stream
 
 
 def test_bundles_beside_a_receiver_give_what_their_table_feeds_at_the_receiver_s_time() -> None:
-    """Values wait for its first fix; what it does not believe, and a reading of another kind, is counted."""
+    """They wait for its first fix; implausible values and foreign readings are counted."""
     late = Articulation("articulation", START_NS + 5 * 10**9, 0.5)
     span = [Torque("torque", START_NS, 7.0), reading(0), Torque("articulation", START_NS, 7.0)]
     feeds = {"articulation": SensorConfig("joint", "articulation")}
@@ -228,7 +228,7 @@ def test_bundles_beside_a_receiver_give_what_their_table_feeds_at_the_receiver_s
 
 
 class Given:
-    """A driver that hands on what it was given, and ends."""
+    """A driver of given readings."""
 
     def __init__(self, *spans: list[Reading]) -> None:
         self._spans = list(spans)
@@ -261,7 +261,7 @@ def run_agent(session: Any, folder: Path, config: AgentConfig, driver: Given, *,
 def test_agent_lingers_for_the_last_samples_unless_it_is_stopped(
     sessions: tuple[Any, Any], tmp_path: Path, linger_s: float, stopped: bool
 ) -> None:
-    """Nobody acknowledges: the samples stay in the spool, and the report says so."""
+    """Without acknowledgement the samples stay in the spool and the report says so."""
     config = AgentConfig(linger_s=linger_s, uplink=UplinkConfig(timeout_s=0.2))
     driver = Given(drive([Leg(4, 0.5), Leg(14)], VEHICLE).readings)
     report, time_ = run_agent(sessions[1], tmp_path, config, driver, stopped=stopped)
@@ -279,9 +279,9 @@ OUT_AND_BACK = (Leg(4, 0.5), Leg(14), Leg(4, -0.5), Leg(2), Leg(4, -0.5), Leg(14
 
 @pytest.mark.slow
 def test_calibration_is_kept_across_restarts(sessions: tuple[Any, Any], tmp_path: Path) -> None:
-    """Whoever drives out and back learns the accelerometer's zero, and the next agent starts with it.
+    """The accelerometer's zero, learnt on a way out and back, serves the next agent.
 
-    A file that makes no sense is reported and replaced.
+    Broken files are reported and replaced.
     """
     zero_mps2, made, reports = 0.05, thinned(drive(OUT_AND_BACK, VEHICLE).readings), []
     readings = [replace(r, force_x_mps2=r.force_x_mps2 + zero_mps2) if isinstance(r, Imu) else r for r in made]

@@ -32,7 +32,7 @@ SENSORS = {
 
 
 def messages(decoder: Any, *frames: bytes, host_ns: int = 0) -> list[Message]:
-    """What a decoder makes of whole frames, without the bare times."""
+    """Messages decoded from whole frames, without bare times."""
     whole = [frame for data in frames for frame in Framer(FRAMINGS).feed(data)]
     made = [message for frame in whole for message in decoder.decode(frame.data, host_ns)]
     return [message for message in made if message.stream != TIME]
@@ -63,12 +63,12 @@ def test_a_frame_is_out_with_its_last_byte_whatever_lengths_before_it_promise() 
     assert [out.data for out in framer.feed(frame[-1:])] == [frame]
 
 
-BY_CHANCE = b"\xb5b" + bytes.fromhex("050102008a23b562")  # a frame whose checksum is how the next one begins
+BY_CHANCE = b"\xb5b" + bytes.fromhex("050102008a23b562")  # a frame whose checksum equals the next one's head
 
 
 @pytest.mark.parametrize("piece", [1, 5, 1 << 20])
 def test_a_false_frame_whose_checksum_fits_by_chance_hides_no_whole_one(piece: int) -> None:
-    """The false one shares two bytes with the next; a third, with a length too long, has both inside."""
+    """The false frame shares two bytes with the next; another, too long, holds both."""
     whole = ubx("NAV-EOE", iTOW=5)
     around = framed(5, 1, BY_CHANCE[:-2] + whole)
     framer, stream = Framer(FRAMINGS), BY_CHANCE[:-2] + whole + b"abc" + around
@@ -190,7 +190,7 @@ def test_a_leap_second_is_the_next_minute_and_a_week_that_rolled_over_is_this_on
 
 @pytest.mark.parametrize(("after_ms", "utc_ms"), [(5, 200), (60, 200), (95, 300)])
 def test_a_heading_without_time_belongs_to_the_epoch_around_it(after_ms: int, utc_ms: int) -> None:
-    """Also where it is sent before the sentences of its epoch."""
+    """Also ahead of its epoch's sentences."""
     decoder = NmeaDecoder()
     for i in (0, 1):
         messages(decoder, nmea(RMC.replace("27.20", f"27.{i + 1}0")), host_ns=i * 10**8)
@@ -199,7 +199,7 @@ def test_a_heading_without_time_belongs_to_the_epoch_around_it(after_ms: int, ut
     assert messages(decoder, nmea("GNTHS,87.1,E")) == [], "estimated"
 
 
-# --- what a receiver does not know -----------------------------------------------------------------------------------
+# --- unknown values --------------------------------------------------------------------------------------------------
 
 
 def test_zeros_are_no_accuracy() -> None:
@@ -243,7 +243,7 @@ def test_talkers_are_receivers_of_their_own_where_a_table_says_so() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["nmea_drive_f9k.nmea", "nmea_rtk_short.log"])
 def test_a_recorded_drive_by_nmea_has_what_the_oracle_reads(name: str) -> None:
-    """The second one begins with a place before the first date."""
+    """The second starts with a place before any date."""
     data = recording(name).read_bytes()[:300_000]
     fixes = [v for v in Line("nmea", SENSORS).feed(data, None) if v.kind == "gps"]
     sentences = pynmeagps.NMEAReader(io.BytesIO(data), quitonerror=0, nmeaonly=False)
@@ -264,7 +264,7 @@ def test_a_recorded_ubx_drive_has_what_the_oracle_reads() -> None:
     places = [place for m in oracle if m.identity == "NAV-PVT" for place in (m.lat, m.lon)]
     assert [place for v in observed if v.kind == "gps" for place in v.values[:2]] == pytest.approx(places, abs=1e-9)
     ticks = [m.dataField_01 for m in oracle if m.identity == "ESF-MEAS" and m.dataType_01 == 10]
-    counted = [v.values[0] for v in observed if v.kind == "encoder"]  # since the file has stated the time
+    counted = [v.values[0] for v in observed if v.kind == "encoder"]  # once the file has stated the time
     assert counted == [(t & 0x7FFFFF) - ticks[0] for t in ticks][-len(counted) :]
     forces = [m.dataField_03 / 1024 for m in oracle if m.identity == "ESF-MEAS" and getattr(m, "dataType_03", 0) == 18]
     imu = [v for v in observed if v.kind == IMU]

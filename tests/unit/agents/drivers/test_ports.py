@@ -1,4 +1,4 @@
-"""Ports of simulated receivers, read by an agent's driver and by gpsd."""
+"""Simulated receivers' ports, read by an agent's driver and gpsd."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from sim.receivers.receiver import SimulatedReceiver, Wiring
 from tests.patience import until
 from tests.unit.agents.drivers.frames import TEN
 
-STEP_NS = 200_000_000  # five fixes a second
+STEP_NS = 200_000_000  # 5 Hz
 FIX = SensorConfig("gps-1", "gps", std={"position": 2.0})
 MOTION = SensorConfig("doppler-1", "gps_velocity", std={"velocity": 0.1})
 WIRING = Wiring("loader-1-gps-1", "nmea", STEP_NS, {"fix": FIX, "velocity": MOTION})
 
 
 def measured(i: int) -> tuple[Gps, GpsVelocity]:
-    """The i-th epoch of a receiver that goes north."""
+    """Epoch i of a receiver moving north."""
     at_ns = TEN * 10**9 + i * STEP_NS
     fix = Gps("gps-1", at_ns, 49.01 + i * 4e-6, 8.4, 157.3, 0.25, 0.25, 1.0)
     return fix, GpsVelocity("doppler-1", at_ns, 0.0, 2.2, 0.0025, 0.0025)
@@ -47,7 +47,7 @@ def test_a_simulated_port_is_read_from_when_it_is_opened_and_is_gone_with_the_si
             until(lambda: values.extend(v for v in source.read(0.0) or () if v.kind == "gps") or values, "a fix")
         source.close()
         for i in range(3, 300):
-            ports.send("loader-1", measured(i))  # nobody listens, and nothing waits
+            ports.send("loader-1", measured(i))  # no listener, no queue
     assert values[0].utc_ns == TEN * 10**9 + STEP_NS
     assert list(tmp_path.iterdir()) == []
 

@@ -41,7 +41,7 @@ GPSD_MACHINE = MachineConfig(
 
 
 class Clock:
-    """The host's monotonic clock, which moves when somebody waits."""
+    """Monotonic clock moved by waiting."""
 
     def __init__(self) -> None:
         self.now_ns = 10**12
@@ -51,7 +51,7 @@ class Clock:
 
 
 class Device:
-    """A serial device on a pseudo terminal; its port is a link that can be gone."""
+    """A serial device on a pseudo-terminal; its port is a link that can vanish."""
 
     def __init__(self, folder: Path) -> None:
         self.port = folder / "ttyACM0"
@@ -67,7 +67,7 @@ class Device:
         os.write(self._master, data)
 
     def baud(self) -> int:
-        """As the other side has set it."""
+        """As set by the other side."""
         return int(termios.tcgetattr(self._slave)[5])
 
     def unplug(self) -> None:
@@ -92,7 +92,7 @@ def receiver(address: object, clock: Clock, format_: str = "nmea", baud: int = 0
 
 
 def listened(source: ReceiverSource, send: Callable[[], object], n: int = 1) -> list[Observed]:
-    """Values of sensors, once so many have come in; sent again and again until they have."""
+    """The first n values or more, sent until they are in."""
     values: list[Observed] = []
 
     def more() -> bool:
@@ -115,7 +115,7 @@ def free_port(kind: socket.SocketKind) -> int:
 
 @contextmanager
 def sender(stream: bytes, greeted: bytes = b"") -> Iterator[str]:
-    """A server that sends a stream to whoever connects, once greeted; then it hangs up."""
+    """A server of one stream: sends once greeted, then hangs up."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def serve() -> None:
@@ -131,7 +131,7 @@ def sender(stream: bytes, greeted: bytes = b"") -> Iterator[str]:
 
 
 def read_all(config: DriverConfig, machine: MachineConfig, n: int) -> list[Reading]:
-    """Readings of one table as an agent takes them."""
+    """One table's readings, as an agent reads them."""
     readings: list[Reading] = []
     with closing(open_sources([config], machine, lambda: (1, 1), no_bundles)) as sources:
         until(lambda: readings.extend(sources.read(0.05) or ()) or len(readings) >= n, "readings")
@@ -139,7 +139,7 @@ def read_all(config: DriverConfig, machine: MachineConfig, n: int) -> list[Readi
 
 
 def epochs(n: int) -> list[bytes]:
-    """Epochs of a receiver, RMC and GGA each; all within the second that a line may be held up."""
+    """RMC and GGA epochs within one second, the longest accepted hold-up."""
     times = [f"{101527 + i / n:010.3f}" for i in range(n)]
     return [nmea(text.replace("101527.20", time)) for time in times for text in (RMC, GGA)]
 
@@ -189,7 +189,7 @@ def test_a_file_is_read_to_its_end_as_fast_as_the_agent_is(tmp_path: Path) -> No
         assert source.problems() == [f"{path}: no frame of NMEA is in this file"]
 
 
-# --- a port that goes and comes --------------------------------------------------------------------------------------
+# --- lost and restored ports -----------------------------------------------------------------------------------------
 
 
 def test_a_receiver_that_is_unplugged_is_read_again_within_two_seconds_of_its_return(device: Device) -> None:
@@ -248,7 +248,7 @@ def test_a_baud_is_found_and_a_wrong_one_is_named(device: Device) -> None:
         assert source.problems() == []
 
 
-# --- wrong set-ups, a sentence each ----------------------------------------------------------------------------------
+# --- set-up errors, one sentence each --------------------------------------------------------------------------------
 
 
 def problem(source: ReceiverSource, clock: Clock, device: Device, data: bytes, step_s: float, n: int) -> str:
@@ -398,12 +398,12 @@ def test_sensors_ticks_free_their_readings_of_what_delays_single_frames() -> Non
 
 LEGS = [Leg(4, 0.6), Leg(15, 0.0, 0.12), Leg(12)]
 SEEN = replace(VEHICLE, sensors=tuple(s for s in VEHICLE.sensors if s.kind != "torque"))
-LATE_NS = {"gps": 60_000_000, "encoder": 8_000_000, "imu": 5_000_000}  # until a message is there
+LATE_NS = {"gps": 60_000_000, "encoder": 8_000_000, "imu": 5_000_000}  # message latency [ns]
 
 
 @pytest.mark.slow
 def test_a_drive_through_bytes_is_the_same_drive() -> None:
-    """Whatever the links delay, and wherever the host's clock stands."""
+    """Whatever the latencies and the host's clock."""
     made, (imu, wheels, gps) = drive(LEGS, SEEN), SEEN.sensors
     feeds = {"fix": gps, "imu": imu, "wheels": wheels}
     line, spoken = Line("ubx", feeds), SimulatedReceiver(Wiring("gps-1", "ubx", 10**9, feeds))

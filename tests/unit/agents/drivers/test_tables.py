@@ -58,7 +58,7 @@ def _toml(value: object) -> str:
 
 
 class Scale(Script):
-    """A plug-in: a weighing system that speaks once."""
+    """A plug-in: a scale with one value."""
 
     def __init__(self, table: DriverConfig, machine: MachineConfig) -> None:
         value = Observed(machine.sensors[0].name, "payload", (float(table.options["kg"]),), 5 * 10**9)

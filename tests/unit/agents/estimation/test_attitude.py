@@ -26,10 +26,10 @@ def angles(slope: SlopeFilter) -> tuple[float, float]:
 
 
 def circle(slope: SlopeFilter, seconds: int, zero: tuple[float, float], tilt: float) -> float:
-    """Drive on a plane that rises by a sine of `tilt` to the east, heading east first, with zeros over g.
+    """Circle on a plane rising by sine `tilt` to the east, first heading east, with zeros over g; returns the last
+    heading.
 
-    Turns of 5 s and straight ways of 5 s; returns the heading at the end. A bias of a gyro looks like a zero as long as
-    a machine turns, and not as it goes straight.
+    Turns and straights of 5 s: a gyro bias resembles a zero only while turning.
     """
     heading = 0.0
     for i in range(round(seconds / STEP_S)):
@@ -44,7 +44,7 @@ def circle(slope: SlopeFilter, seconds: int, zero: tuple[float, float], tilt: fl
 
 @pytest.mark.parametrize("speed", [STANDING, None], ids=["speed known", "gyros alone"])
 def test_turning_on_a_slope_swaps_its_parts(speed: tuple[float, float] | None) -> None:
-    """A quarter turn to the left: what rose ahead now rises to the right."""
+    """A quarter turn to the left: uphill ahead becomes uphill right."""
     slope, tilt = started(0.25), math.sin(0.25)
     for i in range(200):
         turned = math.pi / 2 * (i + 0.5) / 200
@@ -64,7 +64,7 @@ def test_a_turn_tells_the_zero_of_the_accelerometer_from_a_slope() -> None:
 
 
 def test_an_acceleration_is_no_slope() -> None:
-    """Begun and ended at once: what an accelerometer less an acceleration that comes 0.4 s late takes for 1 %."""
+    """Sudden start and end: an acceleration 0.4 s late would seem 1 % of slope."""
     slope, speed, accel = started(), 0.0, -1.5
     for _ in range(200):
         slope.update(STEP_S, STRAIGHT, LEVEL, (speed, 0.0))
@@ -75,10 +75,10 @@ def test_an_acceleration_is_no_slope() -> None:
 
 
 def bends(slope: SlopeFilter, slip: float, speed_mps: float, seconds: int) -> list[tuple[float, float]]:
-    """Drive 5 s straight, 5 s to the left, 5 s straight, 5 s to the right on level ground; returns the sines shown.
+    """Straights and alternating bends of 5 s on level ground; returns the estimated sines.
 
-    slip: angle of the tyres' slip per sideways acceleration [rad s2/m]. The accelerometer feels the machine move
-    outwards, and turn while it does; the wheels see neither.
+    slip: slip angle per lateral acceleration [rad s2/m]. The accelerometer feels the outward motion and its turn, the
+    wheels do not.
     """
     shown, outwards_mps = [], 0.0
     for i in range(round(seconds / STEP_S)):
@@ -96,7 +96,7 @@ def bends(slope: SlopeFilter, slip: float, speed_mps: float, seconds: int) -> li
 
 @pytest.mark.parametrize(("slip", "speed_mps"), [(0.01, -3.0), (0.03, 3.0)])
 def test_tyres_that_slip_in_a_bend_are_no_slope(slip: float, speed_mps: float) -> None:
-    """At 1.2 m/s2 a slip of 0.03 is felt as a slope ahead of 0.4 %: without it in the state, 0.3 % of that remain."""
+    """At 1.2 m/s2 a slip of 0.03 resembles 0.4 % of slope; without the state 0.3 % would remain."""
     slope = SlopeFilter()
     bends(slope, slip, speed_mps, 60)
     ahead, left = np.abs(bends(slope, slip, speed_mps, 60)).max(axis=0)
@@ -105,7 +105,7 @@ def test_tyres_that_slip_in_a_bend_are_no_slope(slip: float, speed_mps: float) -
 
 
 def test_wild_gyros_do_not_make_tyres_slip() -> None:
-    """A gyro that reads 50 rad/s for a second at full speed."""
+    """50 rad/s for a second at full speed."""
     slope = SlopeFilter()
     bends(slope, 0.01, 8.0, 60)
     for _ in range(20):
@@ -115,7 +115,7 @@ def test_wild_gyros_do_not_make_tyres_slip() -> None:
 
 @pytest.mark.parametrize("jump_mps", [0.3, -2.5])
 def test_wheels_that_slip_and_grip_again_are_no_slope(jump_mps: float) -> None:
-    """Sand takes a tenth of the wheels' speed; locked wheels lose all of it."""
+    """Sand takes a tenth of wheel speed, locking all."""
     slope, worst = started(), 0.0
     for i in range(600):
         slips = 200 <= i < 240

@@ -1,4 +1,4 @@
-"""Readings become balances of force: what is left of drive force is direction c_rr cos(slope)."""
+"""Force balances from readings: drive force less the rest is direction c_rr cos(slope)."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,7 @@ BODY = {"wheelbase_m": 3.3, "axle_stiffness_npm": 1.8e6, "cog_height_m": 1.05, "
 
 
 def loader(mount: Mount | None = None, **options: float) -> MachineConfig:
-    """A machine that bends, weighs what it carries, and sits on tyres."""
+    """An articulated machine on tyres that weighs its load."""
     vehicle = machine(mount, **{**BODY, **options})  # type: ignore[arg-type]
     more = SensorConfig("joint", "articulation"), SensorConfig("scale", "payload")
     return replace(vehicle, sensors=(*vehicle.sensors, *more))
@@ -38,7 +38,7 @@ def test_what_is_left_is_the_rolling_resistance(legs: list[Leg], c_rr: float, ah
 
 
 def test_a_load_does_not_rotate() -> None:
-    """By hand: wheels that weigh as much as 0.2 of 17.5 t weigh as much as 0.1 of 35 t."""
+    """By hand: rotating mass 0.2 of 17.5 t equals 0.1 of 35 t."""
     vehicle, rigid = (loader(rotating_mass_factor=factor, axle_stiffness_npm=0.0) for factor in (1.2, 1.0))
     made = drive([Leg(2, payload_kg=17_500), Leg(8, 0.5, payload_kg=17_500)], vehicle).readings
     assert balances(vehicle, made)[-1].unbalanced == pytest.approx(0.04, abs=1e-3)
@@ -53,7 +53,7 @@ def test_mounting_is_turned_back() -> None:
 
 
 def test_lever_arm_of_the_accelerometer_in_a_bend_is_taken_off() -> None:
-    """2.5 m ahead of the rear axle a turn of 0.4 rad/s pulls 0.4 m/s2 backwards: 0.04 of c_rr."""
+    """2.5 m ahead of the rear axle, 0.4 rad/s pulls 0.4 m/s2 backwards: 0.04 of c_rr."""
     vehicle = machine(Mount((2.5, 0.0, 0.9)))
     legs = [Leg(2), Leg(4, 0.5), Leg(6, 0.0, 0.4)]
     made = drive(legs, vehicle)
@@ -67,7 +67,7 @@ def test_lever_arm_of_the_accelerometer_in_a_bend_is_taken_off() -> None:
 
 
 def test_turning_across_a_slope_keeps_slopes_and_resistance_right() -> None:
-    """The wheels' share of the force is off by up to g sin(15 deg) if the slope does not turn with the machine."""
+    """With a fixed slope the force share would be off by up to g sin(15 deg)."""
     ground = Ground(0.04, left_rad=math.radians(15))
     legs = [Leg(2), Leg(4, 0.5), Leg(4), Leg(12, 0.0, 0.25)]
     for at in balances(VEHICLE, drive(legs, VEHICLE, ground=ground).readings)[160:]:
@@ -78,7 +78,7 @@ def test_turning_across_a_slope_keeps_slopes_and_resistance_right() -> None:
 
 
 def test_bent_machine_on_a_side_slope_climbs_with_its_front_axle() -> None:
-    """By hand: 1.5 / 3.3 of the weight stand on the front axle, whose way rises by sin(0.2) sin(bend)."""
+    """By hand: the front axle carries 1.5 / 3.3 of the weight and climbs by sin(0.2) sin(bend)."""
     vehicle, bend_rad = loader(axle_stiffness_npm=0.0, cog_height_m=0.0), -0.5
     legs = [Leg(2), Leg(4, 0.5, bend_rad=bend_rad), Leg(6, bend_rad=bend_rad)]
     made = drive(legs, vehicle, ground=Ground(0.04, 0.0, 0.2)).readings
@@ -86,7 +86,7 @@ def test_bent_machine_on_a_side_slope_climbs_with_its_front_axle() -> None:
     last = balances(vehicle, made)[-1]
     assert last.share == pytest.approx(0.04 + extra, abs=1e-4)
     assert last.unbalanced == pytest.approx(0.04, abs=1e-3)
-    straight = balances(vehicle, [r for r in made if r.sensor != "joint"])[-1]  # nobody says that it is bent
+    straight = balances(vehicle, [r for r in made if r.sensor != "joint"])[-1]  # no joint sensor
     assert straight.unbalanced == pytest.approx(0.04 + extra, abs=1e-3)
 
 
@@ -94,7 +94,7 @@ def test_bent_machine_on_a_side_slope_climbs_with_its_front_axle() -> None:
     ("legs", "on_front", "share"), [(FORWARDS, 1.5 / 3.3, -0.5 + 1.5 / 3.3), (REVERSE, 0.7, 0.2)], ids=["ahead", "back"]
 )
 def test_axles_on_a_curve_stand_on_two_slopes(legs: list[Leg], on_front: float, share: float) -> None:
-    """By hand: 0.01 rad per metre over 3.3 m; the front axle's load is on its steeper half where it is concave."""
+    """By hand: 0.01 rad/m over 3.3 m; the front axle is on the steeper half of a concave curve."""
     vehicle = loader(axle_stiffness_npm=0.0, cog_height_m=0.0, load_centre_m=3.3 * on_front)
     made = drive(legs, vehicle, ground=Ground(0.04)).readings
     speed_mps = 2.0 if legs is FORWARDS else -2.0
@@ -115,7 +115,7 @@ def test_payload_counts_as_mass_and_moves_weight_to_the_front() -> None:
 
 @pytest.mark.parametrize(("payload_kg", "accel_mps2"), [(0.0, 0.8), (4000.0, 0.8)])
 def test_squat_is_no_slope_and_no_resistance(payload_kg: float, accel_mps2: float) -> None:
-    """A full bucket lowers the nose by 0.9 degrees, which would be 0.015 of c_rr and of slope."""
+    """A full bucket lowers the nose by 0.9 degrees: 0.015 of c_rr and slope, uncorrected."""
     vehicle = loader()
     legs = [Leg(2), Leg(4, 0.5, payload_kg=payload_kg), Leg(12, accel_mps2, payload_kg=payload_kg)]
     made = drive(legs, vehicle, ground=Ground(0.04, 0.1)).readings
@@ -190,7 +190,7 @@ def test_without_data_there_is_no_squat_and_none_at_rest_or_beyond_gravity(unkno
 
 
 def test_payload_ahead_of_the_front_axle_lowers_the_nose() -> None:
-    """By hand: 4000 kg at 4.7 m put 61.5 kN on the front axle and take 22.2 kN off the rear one."""
+    """By hand: 4000 kg at 4.7 m load the front axle by 61.5 kN, the rear by -22.2 kN."""
     front_n, rear_n = 4000 * GRAVITY_MPS2 * 4.7 / 3.0, 4000 * GRAVITY_MPS2 * (1 - 4.7 / 3.0)
     assert (front_n, rear_n) == pytest.approx((61_455, -22_228), abs=1)
     assert squat_rad(LOADER, 4000, 0.0) == pytest.approx((rear_n - front_n) / (1.8e6 * 3.0))

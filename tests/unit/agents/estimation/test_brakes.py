@@ -1,4 +1,4 @@
-"""What holds a machine back beside the ground: brakes that are read or not, the air, friction of the drive."""
+"""Other resistances: brakes with and without sensors, air, drive friction."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ BRAKES = SensorConfig("brake", "brake"), SensorConfig("retarder", "brake_force")
 
 
 def braked(readings: Sequence[Reading], vehicle: MachineConfig, sensors: Sequence[SensorConfig]) -> list[Reading]:
-    """The drive by one whose torque never brakes: brakes do, and some of these sensors read them."""
+    """The drive with torque that never brakes: brakes do, read by some of the sensors."""
     out: list[Reading] = []
     for reading in readings:
         if not isinstance(reading, Torque):

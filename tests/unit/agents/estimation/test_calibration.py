@@ -1,4 +1,4 @@
-"""Zero and scale of the balance, calibration by driving the same ground there and back, and on known ground."""
+"""Zero and scale of the balance: calibration there and back, and on known ground."""
 
 import json
 import math
@@ -26,12 +26,12 @@ from tests.unit.agents.drives import START_NS, VEHICLE, Leg, drive
 from tests.unit.agents.ground import STEADY, STEP_S, EstimatorRun
 
 FLAT: Callable[[float], float] = lambda _: 0.0  # noqa: E731
-NOISE = 0.008 * math.sqrt(5)  # of a step: a stretch of 0.5 m is 5 steps
+NOISE = 0.008 * math.sqrt(5)  # per step: a stretch of 0.5 m has 5 steps
 
 
 @dataclass
 class Place:
-    """Where the machine is; stands in for dead reckoning."""
+    """Stands in for dead reckoning."""
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -43,7 +43,7 @@ class Place:
 
 
 class Course:
-    """Drives a calibrator to and fro along a line, over ground and slope by place, with errors of the sensors."""
+    """A calibrator driven to and fro on a line, with ground and slope by place and sensor errors."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class Course:
     def drive(
         self, metres: float, direction: float = 1.0, *, known_c_rr: float | None = None, speed_mps: float = 2.0
     ) -> None:
-        """Straight on, or back, in 0.05 s steps."""
+        """Straight ahead or back, in steps of 0.05 s."""
         for _ in range(round(metres / (speed_mps * STEP_S))):
             self._steps += 1
             self._distance_m += speed_mps * STEP_S
@@ -117,13 +117,13 @@ def test_flat_ground_there_and_back_shows_the_zero(zero: float, c_rr: float) -> 
     assert calibration.zero == pytest.approx(zero, abs=0.0012)
     assert calibration.scale == pytest.approx(0.0, abs=0.045)
     assert math.sqrt(calibration.covariance[0][0]) < 0.0012
-    assert math.sqrt(calibration.covariance[1][1]) > 0.02  # which flat ground does not show
+    assert math.sqrt(calibration.covariance[1][1]) > 0.02  # not observable on flat ground
     assert on.calibrator.counters["pairs"] > 6 * 70
     assert calibration.passages > 6 * 70
 
 
 def test_a_slope_shows_the_scale_too() -> None:
-    """40 m of flat ground, then a ramp of 12 degrees."""
+    """40 m flat, then a 12 degree ramp."""
     scale = -0.05
     on = course(zero=0.004, scale=scale, slope=lambda x: math.radians(12) if x > 20 else 0.0, noise=NOISE, seed=2)
     on.there_and_back(40, 8)
@@ -135,7 +135,7 @@ def test_a_slope_shows_the_scale_too() -> None:
 
 
 def test_a_passage_counts_once() -> None:
-    """There, back, and there again on the same 20 m: each passage is the partner of one other."""
+    """There, back and there on the same 20 m: each passage has one partner."""
     on = course(zero=0.004)
     on.drive(20)
     on.wait(1)
@@ -156,7 +156,7 @@ def test_a_passage_counts_once() -> None:
         ({}, True),
         ({"y_m": 0.5}, True),
         ({"y_m": 0.9}, False),
-        ({"angle_rad": 0.1 + 4 * math.pi}, True),  # full turns of dead reckoning are none
+        ({"angle_rad": 0.1 + 4 * math.pi}, True),  # full turns do not count
         ({"angle_rad": 0.3}, False),
         ({"wait_s": 90.0}, True),
         ({"wait_s": 150.0}, False),
@@ -174,7 +174,7 @@ def test_what_is_the_same_ground(change: dict[str, float], pairs: bool) -> None:
 
 
 def test_pairs_beyond_three_standard_deviations_are_excluded() -> None:
-    """Those of the zero are 0.0045, of the mean of two stretches 0.008 / sqrt(2)."""
+    """Std of the zero 0.0045, of two stretches' mean 0.008 / sqrt(2)."""
     for sigmas, excluded in ((3.3, True), (2.7, False)):
         on = course(zero=sigmas * math.hypot(ZERO_STD, TUNING.stretch_std / math.sqrt(2)))
         on.there_and_back(1)
@@ -182,7 +182,7 @@ def test_pairs_beyond_three_standard_deviations_are_excluded() -> None:
 
 
 def test_a_zero_far_beyond_its_class_is_found_in_the_end() -> None:
-    """0.3 m/s2, ten times what accelerometers are taken for: so many pairs in a row are no border."""
+    """0.3 m/s2, ten times the class: so many pairs in a row are no border."""
     on = course(zero=0.03, noise=NOISE, seed=5)
     on.there_and_back(40, 6)
     assert on.calibrator.counters["relocked"] >= 1
@@ -198,14 +198,14 @@ def test_known_ground_on_a_slope_counts_with_its_cosine_in_both_directions() -> 
     assert (on.calibrator.counters["known_ground"] > 200, on.calibrator.counters["pairs"]) == (True, 0)
 
 
-# --- how sure it is --------------------------------------------------------------------------------------------------
+# --- uncertainty -----------------------------------------------------------------------------------------------------
 
 
 NO_FLOOR = replace(TUNING, floor=1e-12)
 
 
 def test_covariance_is_honest() -> None:
-    """Rms of normalised errors over drives with zero and scale as they are assumed to be."""
+    """Rms of normalised errors, zero and scale drawn from the assumed distribution."""
     errors = []
     for seed in range(25):
         rng = np.random.default_rng(1000 + seed)
@@ -237,7 +237,7 @@ def given(age_s: float = 0.0) -> Calibration:
 
 @pytest.mark.parametrize(("age_s", "std"), [(0.0, 1e-3), (400.0, math.hypot(1e-3, 1.6e-3)), (1e7, 4.5e-3)])
 def test_zero_grows_unsure_as_time_passes_but_never_more_than_at_first(age_s: float, std: float) -> None:
-    """Its random walk is 8e-5 per root of a second; the scale stays."""
+    """Random walk 8e-5 per root second; the scale stays."""
     calibrator = Calibrator(given(age_s), NO_FLOOR)
     calibrator.age(START_NS)
     (zz, _), (_, ss) = calibrator.calibration.covariance
@@ -274,14 +274,14 @@ def test_one_tour_that_is_far_off_is_excluded_and_three_that_agree_are_right() -
 
 
 def test_what_is_applied_can_be_stated_in_a_sample() -> None:
-    """A sensor that is worse than any: its samples would be refused."""
+    """An absurd sensor: its samples would be refused."""
     for sign in (1.0, -1.0):
         beyond = Calibration(sign * 0.3, sign * 0.7, ((1e-6, 0.0), (0.0, 1e-4)))
         calibration = Calibrator(beyond).calibration
         assert (calibration.zero, calibration.scale) == (sign * LIMITS["applied_zero"][1], sign * 0.5)
 
 
-# --- what the map server offers ---------------------------------------------------------------------------------------
+# --- the map server's offers -----------------------------------------------------------------------------------------
 
 NAME, S = VEHICLE.name, 10**9
 OFFER = CalibrationOffer(NAME, START_NS, 0.004, 0.05, 4e-7, 2e-5, 1e-6)
@@ -344,7 +344,7 @@ def test_an_offer_is_no_surer_than_the_floor_and_grows_unsure_with_its_age() -> 
 
 
 def test_what_is_offered_again_and_again_shows_nothing_new() -> None:
-    """Each offer is of the same samples, or nearly; as measurements of their own they would be believed too much."""
+    """Offers share their samples: as independent measurements they would be overconfident."""
     once, often = own(), own()
     once.take(OFFER, START_NS)
     for i in range(50):
@@ -364,7 +364,7 @@ def test_an_offer_that_contradicts_what_is_measured_is_refused_and_counted() -> 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_an_intersection_is_consistent_whatever_the_correlation(seed: int) -> None:
-    """Its covariance is never less than the true one, for independent estimates and for fully dependent ones."""
+    """Its covariance is at least the true one, from independent to fully dependent estimates."""
     draw = np.random.default_rng(seed)
     A, B = (m @ m.T + 0.1 * np.eye(2) for m in draw.normal(size=(2, 2, 2)))
     of_a, of_b = np.linalg.inv(A), np.linalg.inv(B)
@@ -414,7 +414,7 @@ def test_offers_need_a_calibration_of_ones_own() -> None:
         EstimationConfig(calibrate=False, accept_calibration=True)
 
 
-# --- on disk ----------------------------------------------------------------------------------------------------------
+# --- on disk ---------------------------------------------------------------------------------------------------------
 
 KNOWN = Calibration(0.0031, -0.02, ((1e-6, -2e-7), (-2e-7, 1e-4)), 1_767_225_600_000_000_000, 41)
 
@@ -458,7 +458,7 @@ def test_senseless_numbers_are_refused(tmp_path: Path, wrong: dict[str, Any]) ->
 
 @pytest.mark.slow
 def test_no_flipped_bit_is_used(tmp_path: Path) -> None:
-    """Bits all over the file: the calibration is the one that was saved, or an error that names the file."""
+    """Any flipped bit: the saved calibration or an error naming the file."""
     path = tmp_path / "c.json"
     save(path, "loader-1", KNOWN)
     whole, refused = path.read_bytes(), 0

@@ -1,4 +1,4 @@
-"""Closed tours: the zero of an accelerometer by coming back to where one was."""
+"""Closed tours: the accelerometer's zero from returning to a place."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def level(x_m: float, y_m: float) -> float:
 
 
 def ramp(x_m: float, y_m: float) -> float:
-    """Six metres up between x = 30 and 60."""
+    """6 m up from x = 30 to 60."""
     return 6.0 * min(max((x_m - 30.0) / 30.0, 0.0), 1.0)
 
 
 @dataclass
 class Track:
-    """A machine on a polyline: balances and poses, every 50 ms."""
+    """A machine on a polyline: balances and poses at 20 Hz."""
 
     height: Height = level
     zero: float = ZERO
@@ -47,8 +47,8 @@ class Track:
         self.tours = ClosedTours()
         self.shown: list[Tour] = []
         self.stamp_ns, self.distance_m = START_NS, 0.0
-        self.shift_m = (0.9, 0.9)  # of the pose against the true place: no track runs between two cells
-        self.slip: Callable[[float], float] = lambda slope: 1.0  # wheels' distance per metre
+        self.shift_m = (0.9, 0.9)  # pose offset: no track runs between two cells
+        self.slip: Callable[[float], float] = lambda slope: 1.0  # wheel distance per metre
         self.jolts: Callable[[Place], bool] = lambda place: False
 
     def drive(self, *corners: Place) -> Track:
@@ -75,7 +75,7 @@ class Track:
         x, y = place[0] + self.shift_m[0], place[1] + self.shift_m[1]
         pose = PoseBelief(self.stamp_ns, x, y, 0.0, SPEED_MPS, self.std_m**2 * np.eye(2))
         is_jolted = self.jolts(place)
-        if is_jolted:  # the accelerometer shows anything
+        if is_jolted:  # arbitrary accelerometer value
             balance = replace(balance, sine_x=0.5)
         if tour := self.tours.update(balance, pose, is_jolted=is_jolted):
             self.shown.append(tour)
@@ -87,7 +87,7 @@ class Track:
 
 
 def points(corners: tuple[Place, ...]) -> Iterator[tuple[Place, Place]]:
-    """Places along a polyline, and the direction there."""
+    """Places and directions along a polyline."""
     step = SPEED_MPS * STEP_NS * 1e-9
     for (x0, y0), (x1, y1) in pairwise(corners):
         length = math.hypot(x1 - x0, y1 - y0)
@@ -138,7 +138,7 @@ def test_an_inner_tour_is_taken_out_of_the_outer_one() -> None:
 
 
 def test_a_position_that_jumps_tears_the_track() -> None:
-    """A receiver that is reset, an antenna that is moved: the place that looks the same is another one."""
+    """A reset receiver or moved antenna: the apparently same place is another."""
     track = Track(ramp).drive((0.0, 0.0), (90.0, 0.0), (90.0, 90.0))
     track.shift_m = (0.9, 12.9)
     track.drive((90.0, 90.0), (0.0, 90.0), (0.0, -12.0), (20.0, -12.0))
@@ -168,7 +168,7 @@ def test_an_unsure_position_is_no_place_to_come_back_to() -> None:
     for _ in range(3):
         track.drive(*SQUARE)
     assert not track.shown
-    track.std_m = 1.0  # the track goes on: only places of now on are marked
+    track.std_m = 1.0  # the track continues, but marks only later places
     track.drive(*SQUARE).drive(*SQUARE)
     assert len(track.shown) in (1, 2)
     assert track.shown[0].zero == pytest.approx(ZERO, abs=1e-4)

@@ -1,4 +1,4 @@
-"""Machines that creep: the slowest speed with an estimate follows from the wheels' resolution and noise."""
+"""Creeping machines: the slowest speed with estimates follows from wheel resolution and noise."""
 
 import math
 from dataclasses import replace
@@ -15,7 +15,7 @@ RADIUS_M = 0.75
 
 
 def tracked(ticks_per_rev: float, speed_mps: float) -> tuple[WheelTracker, np.ndarray]:
-    """A wheel at a steady speed for a minute, and its tracked speeds."""
+    """A wheel at steady speed for a minute: tracker, speeds."""
     tracker, tick_m, speeds = WheelTracker(), 2 * math.pi * RADIUS_M / ticks_per_rev, []
     for i in range(1, 1200):
         tracker.update(i * 50_000_000, math.floor(i * 0.05 * speed_mps / tick_m) * tick_m)
@@ -28,7 +28,7 @@ def tracked(ticks_per_rev: float, speed_mps: float) -> tuple[WheelTracker, np.nd
 def test_a_wheel_states_how_unsure_its_speed_is(ticks_per_rev: float, speed_mps: float) -> None:
     tracker, speeds = tracked(ticks_per_rev, speed_mps)
     true = float(np.std(speeds[100:] - speed_mps))
-    assert 0.7 * true < tracker.std_mps < 2.2 * true  # more where ticks are rarer than readings
+    assert 0.7 * true < tracker.std_mps < 2.2 * true  # larger where ticks are rarer than readings
 
 
 def test_a_wheel_that_stands_does_not_become_surer() -> None:

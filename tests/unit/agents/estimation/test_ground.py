@@ -1,4 +1,4 @@
-"""The whole ground estimator on made-up drives: readings in, resistance and slope out."""
+"""The whole ground estimator on synthetic drives: from readings to resistance and slope."""
 
 import math
 from dataclasses import replace
@@ -39,7 +39,7 @@ def weighing(**options: Any) -> MachineConfig:
 @pytest.mark.slow
 @pytest.mark.parametrize(("legs", "c_rr", "ahead_rad"), [(FORWARDS, 0.25, SLOPE_RAD), (REVERSE, 0.05, -SLOPE_RAD)])
 def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad: float) -> None:
-    """Positive slope is uphill ahead, also when the machine drives down it backwards."""
+    """Positive slope is uphill ahead, in reverse too."""
     made = drive(legs, VEHICLE, ground=Ground(c_rr, ahead_rad))
     for estimator in ESTIMATORS:
         estimate = last_estimate(VEHICLE, made, estimator=estimator)
@@ -60,11 +60,11 @@ def test_estimates_state_the_mass_as_it_is_weighed(mass: str, stated_kg: float) 
         assert estimate.c_rr == pytest.approx(0.06 + wrong, abs=0.005)
 
 
-# --- how sure it is --------------------------------------------------------------------------------------------------
+# --- uncertainty -----------------------------------------------------------------------------------------------------
 
 
 def test_variance_has_its_parts() -> None:
-    """That of the model, of zero and of scale, beside the filter's."""
+    """Filter, model, zero and scale."""
     made = drive(FORWARDS, VEHICLE)
     base = last_estimate(VEHICLE, made).c_rr_var
     for zero_std, scale_std, more in (
@@ -81,7 +81,7 @@ def test_variance_has_its_parts() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["kalman", pytest.param("rls", marks=pytest.mark.nightly)])
 def test_normalised_errors_are_about_one(estimator: str) -> None:
-    """Machines with sensors as bad as they are taken to be, on a slope and without anything learnt of them."""
+    """Uncalibrated machines on a slope with errors of the assumed size."""
     vehicle, errors = machine(), []
     legs = [STAND, START, Leg(6), Leg(3, 0.2), Leg(3, -0.2), Leg(4)]
     made = {ahead: thinned(drive(legs, vehicle, ground=Ground(0.05, ahead)).readings, 20) for ahead in (0.0, 0.1)}
@@ -98,7 +98,7 @@ def test_normalised_errors_are_about_one(estimator: str) -> None:
     assert 0.5 < rms < 1.5, rms
 
 
-# --- what is not known -----------------------------------------------------------------------------------------------
+# --- unknown ---------------------------------------------------------------------------------------------------------
 
 
 def test_standing_machine_learns_nothing_and_keeps_what_it_knew() -> None:
@@ -145,7 +145,7 @@ def cycles(vehicle: MachineConfig, n: int, **ground: Any) -> list[Reading]:
 
 
 def off(readings: list[Reading], zero_mps2: float, torque: float = 1.0) -> list[Reading]:
-    """With an accelerometer and a torque sensor that are off."""
+    """With accelerometer and torque errors."""
     return [
         replace(r, force_x_mps2=r.force_x_mps2 + zero_mps2)
         if isinstance(r, Imu)
@@ -158,7 +158,7 @@ def off(readings: list[Reading], zero_mps2: float, torque: float = 1.0) -> list[
 
 @pytest.mark.slow
 def test_zero_is_found_by_the_work_cycle() -> None:
-    """0.06 m/s2 are 0.006 of c_rr, each direction the other way; slope ahead is put right too."""
+    """0.06 m/s2 are 0.006 of c_rr, opposite by direction; the slope is corrected too."""
     readings = off(cycles(VEHICLE, 3), 0.06)
     run, without = (EstimatorRun(VEHICLE, EstimationConfig(calibrate=c)).feed(readings) for c in (True, False))
     for direction in ((79.5, 83.5), (97.5, 101.5)):  # of the last cycle
@@ -192,10 +192,10 @@ def test_new_calibration_takes_effect_at_a_standstill_only() -> None:
 
 @pytest.mark.slow
 def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
-    """Without what it states, it is that of a machine that does not calibrate itself."""
+    """Taking it out gives the estimate of an uncalibrated machine."""
     readings = off(cycles(VEHICLE, 3, ahead_rad=0.1), -0.06, torque=1.04)
     runs = [EstimatorRun(VEHICLE, EstimationConfig(calibrate=each)).feed(readings) for each in (True, False)]
-    assert len({own.zero for _, own in runs[0].estimates}) > 2  # it changes on the drive
+    assert len({own.zero for _, own in runs[0].estimates}) > 2  # changes during the drive
     for direction, *span in ((1, 79.5, 83.5), (-1, 97.5, 101.5)):
         pairs = list(zip(*(run.between(*span) for run in runs), strict=True))
         assert len(pairs) > 30
@@ -210,7 +210,7 @@ def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_a_jolt_on_the_way_does_not_hide_the_zero() -> None:
-    """Three steps of the balance at the end of what is plausible, as at the foot of a ramp."""
+    """Three steps at the limit of plausibility, as at a ramp's foot."""
     made = off(thinned(drive([STAND, START, Leg(80, turn_radps=0.1)], VEHICLE).readings), 0.06)
     jolt_ns = range(START_NS + 40_000_000_000, START_NS + 40_150_000_000)
     readings = [replace(r, force_z_mps2=17.0) if isinstance(r, Imu) and r.stamp_ns in jolt_ns else r for r in made]
@@ -218,6 +218,6 @@ def test_a_jolt_on_the_way_does_not_hide_the_zero() -> None:
     health = run.estimator.health()["calibration"]
     assert "accelerometer" in [e.reason for e in run.between(39, 42)]
     assert (health["tours"], health["torn"]) == (1, 0)
-    assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.0015)  # one tour, and the data sheet
+    assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.0015)  # from one tour and the data sheet
     plain = EstimatorRun(VEHICLE, EstimationConfig(closed_tours=False), knows_place=True).feed(readings)
     assert plain.estimator.health()["calibration"]["zero"] == 0.0

@@ -1,4 +1,4 @@
-"""Drive force from engine and motor: known answers, and what makes it unknown."""
+"""Drive force of engine and motor: known answers, unknown cases."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ TRAIN = PowertrainConfig(
     efficiency=0.9,
 )
 RADIUS_M = 0.75
-SECOND_RADPS = 24.0 * 2.0 / RADIUS_M  # of the engine in the second gear at 2 m/s
+SECOND_RADPS = 24.0 * 2.0 / RADIUS_M  # engine speed, second gear, 2 m/s
 SENSORS = SensorConfig("engine", "engine"), SensorConfig("gearbox", "driveline")
 
 
@@ -69,8 +69,8 @@ def test_speeds_between_gears_show_none(engine_radps: float, wheel_radps: float)
 def test_a_motor_drives_by_its_ratio_or_by_power_over_speed() -> None:
     electric = PowertrainConfig(gears=(1.0,), final_drive=30.0, efficiency=0.9)
     assert motor_force(electric, 500.0, 3.0) == pytest.approx(500 * 30 * 0.9)
-    assert motor_force(electric, -500.0, 3.0) == pytest.approx(-500 * 30 / 0.9)  # it brakes
-    assert motor_force(electric, -500.0, -3.0) == pytest.approx(-500 * 30 * 0.9)  # it drives back
+    assert motor_force(electric, -500.0, 3.0) == pytest.approx(-500 * 30 / 0.9)  # braking
+    assert motor_force(electric, -500.0, -3.0) == pytest.approx(-500 * 30 * 0.9)  # driving back
     assert power_drive(electric, 60_000.0, 3.0).force_n == pytest.approx(18_000)
     assert power_drive(electric, 60_000.0, -3.0).force_n == pytest.approx(-18_000)
     assert power_drive(electric, 60_000.0, 0.4).unknown == "creeps"
@@ -94,7 +94,7 @@ LOADER = replace(TRAIN, idle_pressure_pa=3e6)
         (Driveline("d", 10**9, 1, 0, 0), TRAIN, "converter"),
         (Driveline("d", 10**9, 1, 1, 1), TRAIN, "gear_change"),
         (Engine("engine", 10**9, 0.5, 1.4 * SECOND_RADPS), TRAIN, "no_gear"),
-        (EngineLosses("l", 10**9, 0.1), LOADER, "hydraulics"),  # nothing states its pressure
+        (EngineLosses("l", 10**9, 0.1), LOADER, "hydraulics"),  # pressure unknown
         (HydraulicPressure("h", 10**9, 2e7), LOADER, "hydraulics"),
         (HydraulicPressure("h", 10**9, 2e6), LOADER, ""),
     ],
@@ -116,7 +116,7 @@ def test_torque_at_the_wheels_counts_before_what_a_motor_or_engine_states() -> N
 
 
 def by_engine(readings: Sequence[Reading], gear: float = 24.0) -> list[Reading]:
-    """The drive as an engine states it: torque in steps of 1 %, speed in those of 1/8 rpm."""
+    """The drive as reported by an engine: torque steps 1 %, speed steps 1/8 rpm."""
     made: list[Reading] = []
     ticks = [r for r in readings if isinstance(r, Encoder)]
     speeds = {

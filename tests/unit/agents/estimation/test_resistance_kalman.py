@@ -1,4 +1,4 @@
-"""The filter against least squares, its smoother against the joint Gaussian, borders, memory, and the mass."""
+"""The filter against least squares and the joint Gaussian; borders, memory, mass."""
 
 import itertools
 import math
@@ -16,9 +16,9 @@ from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS
 from tests.unit.agents.ground import STEP_S, feed, level_steps, white_noise
 
-QUIET = 0.002  # half of the noise that is assumed at least: none is measured beyond it
+QUIET = 0.002  # half the least assumed noise: no more is measured
 NO_BORDERS = replace(TUNING, borders_per_m=1e-300)
-STILL = replace(NO_BORDERS, walk=1e-9)  # a ground that does not change
+STILL = replace(NO_BORDERS, walk=1e-9)  # constant ground
 STEP_NS = round(STEP_S * 1e9)
 
 
@@ -33,24 +33,24 @@ def at_step(kalman: KalmanResistance, index: int) -> tuple[float, float]:
 
 
 def borders(kalman: KalmanResistance) -> list[int]:
-    """Indices of steps since the start that begin a new ground."""
+    """Steps since the start that begin a new ground."""
     return [round((s.measured.step.stamp_ns - START_NS) / STEP_NS) for s in kalman._steps if s.border]
 
 
 def nearest_border(kalman: KalmanResistance, index: int) -> int:
-    """How many steps the nearest one is off."""
+    """Distance of the nearest one, in steps."""
     return min((abs(i - index) for i in borders(kalman)), default=99)
 
 
 def scale_of(kalman: KalmanResistance) -> tuple[float, float]:
-    """Scale error and its variance."""
+    """Scale error, variance."""
     newest = kalman._steps[-1]
     return float(newest.x[2]), float(newest.P[2, 2])
 
 
 @pytest.mark.parametrize(("border", "wheelbase_m"), [(12, 0.0), (None, 0.5), (12, 0.5)])
 def test_smoother_is_the_joint_gaussian(border: int | None, wheelbase_m: float) -> None:
-    """All states at once: c_rr walks, jumps where a border is; a step sees the ground of both axles."""
+    """Joint estimate: c_rr walks and jumps at a border; each step sees the ground of both axles."""
     seed, n = 2, 30
     rng = np.random.default_rng(seed)
     tuning = replace(NO_BORDERS, walk=0.02, unknown_std=0.08)
@@ -62,25 +62,25 @@ def test_smoother_is_the_joint_gaussian(border: int | None, wheelbase_m: float) 
     x, P = joint(raw, border, tuning, wheelbase_m)
     for index in range(n):
         centre = index
-        if border and wheelbase_m and 0 <= index - border < 2:  # 0.2 m ahead of it: the load centre has not come up
+        if border and wheelbase_m and 0 <= index - border < 2:  # within 0.2 m of it the load centre is still behind
             centre = border - 1
         assert at_step(kalman, index) == pytest.approx((x[centre], P[centre, centre]), rel=1e-3), f"{seed=} {index=}"
 
 
 def joint(raw: Floats, border: int | None, tuning: EstimationTuning, wheelbase_m: float = 0.0) -> tuple[Floats, Floats]:
-    """Posterior mean (n,) and covariance (n, n) of c_rr under the leading axle at all steps."""
+    """Posterior mean (n,) and covariance (n, n) of c_rr under the leading axle."""
     n = len(raw)
     walk = tuning.walk**2 * 2.0 * STEP_S
     mean, variance = np.full(n, tuning.first_c_rr), tuning.unknown_std**2 + walk * np.arange(1, n + 1)
     new = np.zeros(n, bool)
-    if border is not None:  # what was known before is forgotten but for the value
+    if border is not None:  # of earlier knowledge only the value remains
         new[border:] = True
         mean[border:] = joint(raw[:border], None, tuning)[0][-1]
         variance[border:] = tuning.unknown_std**2 + walk * np.arange(1, n - border + 1)
     prior = np.where(new[:, None] == new, np.minimum(variance[:, None], variance), 0.0)
     H = np.eye(n)
     if border is not None and wheelbase_m:
-        for i in range(border, border + round(wheelbase_m / 0.1)):  # until the trailing axle has come up
+        for i in range(border, border + round(wheelbase_m / 0.1)):  # until the trailing axle arrives
             H[i, i], H[i, border - 1] = 0.6, 0.4
     gain = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + tuning.noise**2 / STEP_S * np.eye(n))
     return mean + gain @ (raw - H @ mean), prior - gain @ H @ prior
@@ -103,7 +103,7 @@ def test_border_is_dated_to_where_it_began() -> None:
 
 @pytest.mark.slow
 def test_a_border_is_taken_back_where_it_was_a_bump() -> None:
-    """A second of noise that goes one way may look like a border, until what comes next is as before."""
+    """A second of one-sided noise resembles a border until the old value returns."""
     raw = 0.04 + 0.03 * ((np.arange(200) >= 100) & (np.arange(200) < 120))
     kalman, seen = KalmanResistance(), []
     for step in level_steps(raw):
@@ -120,7 +120,7 @@ AXLES = {"wheelbase_m": 3.3, "lead_m": 1.8, "lead_share": 0.45}
 
 
 def crossing(before: float, behind: float, at_m: float, metres: float = 20.0) -> list[BalanceStep]:
-    """A machine whose front axle is at way 0 first drives over a border; no noise."""
+    """A front axle from way 0 over a border, noise-free."""
     steps: list[BalanceStep] = []
     for step in level_steps(np.zeros(round(metres / 0.1))):
         lead_m = 0.1 * (len(steps) + 1)
@@ -142,7 +142,7 @@ def test_border_that_two_axles_cross_is_one(before: float, behind: float) -> Non
 
 
 def test_back_across_a_border_half_crossed() -> None:
-    """The front axle 1 m on the new ground, then home: the old ground is found again behind."""
+    """The front axle 1 m onto new ground, then back: the old ground is found again."""
     kalman = KalmanResistance()
     there = crossing(0.03, 0.12, 9.0, 10.0)
     feed(kalman, there)
@@ -176,18 +176,18 @@ def test_memory_is_bounded_and_answers_stay_right() -> None:
 
 
 def at_work(scale: float, seconds: float, seed: int, c_rr: float = 0.05, start: int = 0) -> list[BalanceStep]:
-    """A loader that accelerates and climbs; drive force over the mass that it believes in is off by a scale."""
+    """A loader accelerating and climbing, with a scale error of drive force over assumed mass."""
     rng = np.random.default_rng(seed)
     n = round(seconds / STEP_S)
     taken = 0.08 * np.sin(0.05 * np.arange(n)) + 0.04 * np.sin(0.013 * np.arange(n))
-    share = (1 + scale) * (c_rr + taken)  # what it reads
+    share = (1 + scale) * (c_rr + taken)  # measured
     steps = level_steps(share - taken + white_noise(0.004, n, rng), share=share)
     return [replace(s, stamp_ns=s.stamp_ns + start * STEP_NS) for s in steps]
 
 
 @pytest.mark.slow
 def test_wrong_mass_is_found_where_forces_vary() -> None:
-    """raw = c_rr + scale error / (1 + ...) * share: what drives in excess of what the motion takes."""
+    """raw = c_rr + scale error / (1 + ...) * share: drive force beyond the motion's."""
     kalman, blind = (KalmanResistance(estimates_mass=m) for m in (True, False))
     scale = -0.2
     steps = at_work(scale, 90, 1)
@@ -232,7 +232,7 @@ def test_recalibrated_is_as_if_all_steps_had_had_the_new_calibration(steps: int)
 
 @pytest.mark.slow
 def test_a_change_of_the_calibration_soon_after_a_turn_is_no_border() -> None:
-    """A zero counts with opposite signs ahead and in reverse, so what both say of one ground is not shifted by it."""
+    """A zero counts oppositely ahead and in reverse, so it is not a common shift."""
     rng = np.random.default_rng(11)
     reverse, zero = 20, 0.01
     n = 300 + reverse + 100
@@ -247,7 +247,7 @@ def test_a_change_of_the_calibration_soon_after_a_turn_is_no_border() -> None:
     assert at_step(kalman, n - 1)[0] == pytest.approx(0.04, abs=4e-3)
 
 
-# --- the search for borders, against all histories that there are -----------------------------------------------------
+# --- border search against all histories -----------------------------------------------------------------------------
 
 WHITE = 0.004
 R = WHITE**2 / STEP_S
@@ -257,13 +257,13 @@ STEP_M = 0.1
 def borders_after(
     steps: Sequence[BalanceStep], remembered: int = 200, tuning: EstimationTuning = TUNING
 ) -> list[tuple[int, ...]]:
-    """The borders after each step, by its index."""
+    """Indices of the borders after each step."""
     search = BorderSearch(remembered, tuning)
     return [search.update(index, step, step.raw, R) for index, step in enumerate(steps)]
 
 
 def evidence(raw: Floats, history: Sequence[int]) -> float:
-    """How likely raw values (n,) of one axle are, in logarithms, with borders before these: Gaussians, part by part."""
+    """Log likelihood of one axle's raw values (n,) with these borders: Gaussian by part."""
     total, mean, first_var = 0.0, TUNING.first_c_rr, TUNING.unknown_std**2
     for begin, end in itertools.pairwise([0, *history, len(raw)]):
         part, walked = raw[begin:end], np.arange(1, end - begin + 1) * TUNING.uneven**2 * STEP_M
@@ -278,7 +278,7 @@ def evidence(raw: Floats, history: Sequence[int]) -> float:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_no_history_is_likelier_than_the_one_that_is_found(seed: int) -> None:
-    """All with two borders at most. A border is known by what is behind it, so the last steps have none."""
+    """All with at most two borders. Borders show by what follows, so the last steps have none."""
     rng = np.random.default_rng(seed)
     levels = rng.choice([0.02, 0.06, 0.1, 0.25], 3, replace=False)
     raw = levels[np.minimum(np.arange(30) // 10, 2)] + white_noise(WHITE, 30, rng)
@@ -304,7 +304,7 @@ def test_histories_are_few_and_forget_what_nobody_asks_for() -> None:
 
 
 def test_after_a_long_way_of_which_nothing_is_known_another_ground_is_no_surprise() -> None:
-    """Digging for a minute: a difference that is too small for a border on 0.1 m is one after 60 m."""
+    """A minute of digging: a difference too small for a border at 0.1 m is one after 60 m."""
     raw = 0.03 + 0.02 * (np.arange(60) >= 40)
     near = level_steps(raw)
     far = [replace(step, distance_m=60.0) if index == 40 else step for index, step in enumerate(near)]

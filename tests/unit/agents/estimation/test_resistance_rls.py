@@ -1,4 +1,4 @@
-"""The algorithm against its formulas, and what it follows: a mass that stays and a ground that jumps."""
+"""The algorithm against its formulas: constant mass, jumping ground."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,7 @@ from tests.unit.agents.ground import STEP_S, feed, level_steps
 def by_the_paper(
     ys: Floats, hs: Floats, variance: Floats, forget: Floats, dt_s: float
 ) -> tuple[list[list[float]], list[list[float]]]:
-    """The docstring's formulas, written out for two parameters; parameters and variances after each step."""
+    """The docstring's formulas for two parameters: parameters and variances by step."""
     (p1, p2), (l1, l2) = variance, (f**dt_s for f in forget)
     theta1 = theta2 = 0.0
     thetas, variances = [], []

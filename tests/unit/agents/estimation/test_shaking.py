@@ -1,4 +1,4 @@
-"""Machines that shake: what gates believe of them, and the longer steps that the estimator gets."""
+"""Shaking machines: gates, and the estimator's longer steps."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ LONG = int(LONG_S / STEP_S)
 
 
 def shaken(steps: Sequence[Balance], force_mps2: float, rate_radps: float, seed: int) -> list[Balance]:
-    """The same steps of a body that shakes and goes nowhere, by so much ahead and in pitch."""
+    """Add stationary shaking, ahead and in pitch."""
     rng = np.random.default_rng(seed)
     moved, turned = (np.diff(rng.standard_normal(len(steps) + 1)) / math.sqrt(2) for _ in range(2))
     return [
@@ -34,7 +34,7 @@ def shaken(steps: Sequence[Balance], force_mps2: float, rate_radps: float, seed:
 
 
 def at_work(seconds: float, gain: float = 1.0) -> list[Balance]:
-    """A machine that starts, stops and climbs all the time, whose torque is too large by a gain."""
+    """A machine starting, stopping and climbing, with a torque gain."""
     steps = []
     for i in range(round(seconds / 0.05)):
         accel, climb = 0.05 * math.sin(0.4 * i * 0.05), 0.08 * math.sin(0.05 * i * 0.05)
@@ -56,7 +56,7 @@ def share_of(reason: str, judged: Sequence[str]) -> float:
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("force_mps2", "rate_radps", "least"), [(0.5, 0.03, 0.97), (0.9, 0.1, 0.95), (2.2, 0.15, 0.9)])
 def test_a_machine_that_shakes_is_believed(force_mps2: float, rate_radps: float, least: float, seed: int) -> None:
-    judged = reasons(shaken(at_work(120), force_mps2, rate_radps, seed))[100:]  # 5 s: it has to be measured
+    judged = reasons(shaken(at_work(120), force_mps2, rate_radps, seed))[100:]  # after 5 s, the time to measure it
     assert share_of("", judged) > least, f"{seed=} {set(judged)}"
     assert "torque_implausible" not in judged
 
@@ -71,14 +71,14 @@ def test_a_wrong_unit_is_found_on_a_machine_that_shakes(gain: float, force_mps2:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_shaking_alone_shows_nothing_of_the_torques_unit(seed: int) -> None:
-    """On level ground at a steady speed, noise of one side alone made the slope 0."""
+    """At steady speed on level ground, noise on one side alone made the slope 0."""
     level = [after(i, share=0.06 + 0.01 * math.sin(i * 0.02), unbalanced=0.06) for i in range(6000)]
     assert "torque_implausible" not in reasons(shaken(level, 2.2, 0.1, seed)), f"{seed=}"
 
 
 @pytest.mark.parametrize("rate_radps", [0.0, 0.1])
 def test_a_ramps_foot_is_withheld_whether_or_not_the_machine_shakes(rate_radps: float) -> None:
-    """15 degrees over a wheelbase of 3.3 m, at 2 m/s."""
+    """15 degrees over a wheelbase of 3.3 m, 2 m/s."""
     level = [after(i) for i in range(400)]
     ramp = [after(400 + i, pitch_radps=math.radians(15) * 2 / 3.3) for i in range(33)]
     judged = reasons(shaken([*level, *ramp], 0.9 if rate_radps else 0.0, rate_radps, seed=0))

@@ -1,4 +1,4 @@
-"""Machines that skid-steer, stated or seen; and ones that only look so."""
+"""Skid steering: stated, detected, and only apparent."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -13,14 +13,14 @@ from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, Ground, Leg, drive, machine
 from tests.unit.agents.ground import EstimatorRun
 
-TICK_RAD = 0.0628  # of 100 a turn
+TICK_RAD = 0.0628  # 100 ticks a turn
 TURNS = [Leg(2), Leg(4, 0.5), Leg(10), Leg(10, 0.0, 0.2), Leg(10)]
 ROBOT = machine(wheelbase_m=3.3)
 BY_ODOMETRY = replace(ROBOT, sensors=(ROBOT.sensors[0], SensorConfig("wheels", "odometry")))
 
 
 def readings(vehicle: MachineConfig, motions: Iterable[tuple[float, float, float]]) -> Iterator[Reading]:
-    """Seconds, speed of the wheels in the middle [m/s], and turn rate by gyro and wheels [rad/s]; a track of 2 m."""
+    """From seconds, mid speed of the wheels [m/s], turn rate by gyro and by wheels [rad/s]; track 2 m."""
     stamp_ns, left, right = START_NS, 0.0, 0.0
     for seconds, speed, rate in motions:
         for _ in range(round(seconds / 0.05)):
@@ -50,7 +50,7 @@ def seen(vehicle: MachineConfig, made: Iterable[Reading]) -> bool:
         ([(10, 1.0, 0.0), (6, 0.0, 0.4)], True),  # turns on the spot
         ([(10, 1.0, 0.0), (6, 0.0, -0.4)], True),
         ([(60, 1.0, 0.3)], False),  # a bend of 3 m
-        ([(3, 0.0, 0.2), (3, 0.0, -0.2)] * 9, False),  # a joint that is bent to and fro at a stand
+        ([(3, 0.0, 0.2), (3, 0.0, -0.2)] * 9, False),  # standing articulation to and fro
         ([(60, 0.0, 0.0)], False),
     ],
 )
@@ -60,7 +60,7 @@ def test_a_machine_that_turns_on_the_spot_skid_steers(vehicle: MachineConfig, mo
 
 
 def test_a_wheel_of_the_wrong_sign_and_a_machine_that_is_carried_are_no_skid_steering() -> None:
-    """One seems to turn on the spot and does not turn; the other turns and its wheels stand."""
+    """One seems to turn on the spot and does not; the other turns with standing wheels."""
     straight = [
         replace(r, left_ticks=-r.left_ticks) if isinstance(r, Encoder) else r for r in readings(ROBOT, [(30, 1, 0)])
     ]

@@ -19,7 +19,7 @@ def test_no_alignment_where_all_positions_coincide() -> None:
 
 
 def fixes(length_m: float, turn_rad: float, n: int = 8, **options: Any) -> list[Fix]:
-    """Of a straight drive ahead in dead reckoning, that leads from (5, 7) in a direction of the map; 1 and 3 m2."""
+    """A straight drive of dead reckoning that starts at (5, 7) in some map direction; 1 and 3 m2."""
     sensor = SensorConfig("gps", "gps", Mount((1.0, 0.0, 3.0)), **options)
     along = np.linspace(0.0, length_m, n)
     c, s = math.cos(turn_rad), math.sin(turn_rad)
@@ -41,10 +41,10 @@ def reckoned(x_m: float = 0.0) -> DeadReckonedPose:
     "collected",
     [
         fixes(20.0, 0.9, n=3),  # too few
-        fixes(2.0, 0.9),  # there and back, in one place
-        fixes(20.0, 0.9, mode="relative"),  # nothing absolute
-        stating(fixes(20.0, 0.9), 30.0),  # too unsure
-        [*stating(fixes(20.0, 0.9), 30.0), *fixes(2.0, 0.9)],  # what is sure has no spread
+        fixes(2.0, 0.9),  # to and fro, no spread
+        fixes(20.0, 0.9, mode="relative"),  # none absolute
+        stating(fixes(20.0, 0.9), 30.0),  # too uncertain
+        [*stating(fixes(20.0, 0.9), 30.0), *fixes(2.0, 0.9)],  # no spread of the certain ones
     ],
 )
 def test_heading_is_not_taken_from_too_little(collected: list[Fix]) -> None:
@@ -57,7 +57,7 @@ def shifted(collected: list[Fix], east_m: float) -> list[Fix]:
 
 @pytest.mark.parametrize("first_off", [2, 8])
 def test_a_first_stretch_that_is_off_does_not_count(first_off: int) -> None:
-    """By 40 m, which the receiver does not state."""
+    """An unreported error of 40 m."""
     whole = fixes(40.0, 0.9, n=20)
     alignment = align_fixes([*shifted(whole[:first_off], 40.0), *whole[first_off:]])
     assert alignment.rotation_rad == pytest.approx(0.9)
@@ -73,7 +73,7 @@ def step(force: tuple[float, float, float] | None = None) -> tuple[FilterStep, l
 
 
 def test_start_lies_where_it_is_given_and_as_the_forces_show() -> None:
-    """0.1 rad to its right side and 0.2 rad nose up."""
+    """0.1 rad to its right, 0.2 rad nose up."""
     force = (GRAVITY_MPS2 * math.sin(0.2), GRAVITY_MPS2 * math.sin(0.1), 9.0)
     alignment = align_start((50.0, 60.0, 3.0), step()[0].reckoned)
     belief = start_belief(alignment, *step(force), Layout(imus=1, wheel_scale=True), 0.0)
@@ -86,13 +86,13 @@ def test_start_lies_where_it_is_given_and_as_the_forces_show() -> None:
 
 
 def test_start_is_where_the_machine_is_now_not_where_dead_reckoning_began() -> None:
-    """Reckoned 3 m ahead and 4 m to the left, turned by 0.3 rad, before the start is applied."""
+    """Dead reckoning has moved 3 m ahead, 4 m left, 0.3 rad before the start is applied."""
     alignment = align_start((50.0, 60.0, 3.0), DeadReckonedPose(9, 5.0, 0.3, 3.0, 4.0))
     moved = replace(step()[0], reckoned=DeadReckonedPose(9, 5.0, 0.3, 3.0, 4.0))
     belief = start_belief(alignment, moved, [], Layout(), 0.0)
     assert belief.x[:2] == pytest.approx((50.0, 60.0))
     assert belief.x[YAW] == pytest.approx(3.0)
-    back = start_belief(alignment, step()[0], [], Layout(), 0.0)  # the first step, where it had only turned by 0.3 rad
+    back = start_belief(alignment, step()[0], [], Layout(), 0.0)  # the first step: only 0.3 rad turned
     c, s = math.cos(2.7), math.sin(2.7)
     assert back.x[:2] == pytest.approx((50.0 - 3 * c + 4 * s, 60.0 - 3 * s - 4 * c))
 

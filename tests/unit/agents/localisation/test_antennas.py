@@ -1,4 +1,4 @@
-"""Antennas that do not sit as their mounts say are named; those that do never are."""
+"""Antennas away from their mounts are named, others never."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Gps, Reading
 from tests.unit.agents.drives import S_BEND, SITE, Leg, changed_sensor, drive, with_ahrs
 
-RTK, ALONE = 0.02, 1.5  # standard deviations of fixes [m]
+RTK, ALONE = 0.02, 1.5  # std of fixes [m]
 FRONT, REAR = Mount((1.2, 0.0, 3.0)), Mount((-0.8, 0.0, 3.0))
 TRUE = MachineConfig(
     "truck-1",
@@ -35,7 +35,7 @@ def problems(machine: MachineConfig, readings: Sequence[Reading]) -> dict[str, s
 
 
 def noisy_fixes(readings: Sequence[Reading], std_m: float, off_m: float = 0.0, seed: int = 5) -> list[Reading]:
-    """Fixes of this accuracy; those of gps-2 lie further north by a slow error that lasts."""
+    """Fixes of this std; gps-2 has a slow error to the north."""
     rng = np.random.default_rng(seed)
 
     def noised(r: Gps) -> Gps:
@@ -79,7 +79,7 @@ def test_fixes_of_metres_name_nothing_before_their_error_has_faded() -> None:
 
 
 def minutes_until_named(apart_m: float) -> int:
-    """Of two antennas that are exchanged, a stretch every three seconds; variances are those of both on both axes."""
+    """Two swapped antennas, a stretch per 3 s; variances of both, both axes."""
     variance = 2 * 2 * ALONE**2
     trial = Trial(apart_m, white=0.25 * variance, slow=0.75 * variance, slow_s=45.0)
     while trial.wrong is None:

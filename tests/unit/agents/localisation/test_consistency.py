@@ -40,9 +40,9 @@ def test_white_innovations_of_the_right_size_are_good() -> None:
 @pytest.mark.parametrize(
     ("monitor", "name"),
     [
-        (monitored(white(), std=0.4), "nis"),  # the filter thinks itself better than it is
-        (monitored(white(), std=4.0), "nis"),  # and worse
-        (monitored(np.repeat(white(n=15), 10, axis=0)), "correlation"),  # an error that stays
+        (monitored(white(), std=0.4), "nis"),  # filter overconfident
+        (monitored(white(), std=4.0), "nis"),  # filter underconfident
+        (monitored(np.repeat(white(n=15), 10, axis=0)), "correlation"),  # lasting error
         (monitored(white(), accepted=False), "gated"),
     ],
 )
@@ -69,7 +69,7 @@ def test_measurements_that_are_no_numbers_say_nothing_of_the_filter() -> None:
 
 
 def noted(slow_error: float, seconds: float) -> InnovationMonitor:
-    """Five innovations a second as they should be, with a slow error of this mean square."""
+    """Consistent innovations at 5 Hz with a slow error of this mean square."""
     monitor = InnovationMonitor()
     for i, innovation in enumerate(white(n=round(5 * seconds))):
         belief = Belief(START_NS + i * 200_000_000, np.zeros(2), np.eye(2))
@@ -100,7 +100,7 @@ def test_a_slow_error_is_no_verdict_before_it_has_lasted() -> None:
 
 
 def followed(std: float, seconds: float = 300.0, rate_hz: float = 5.0, accepted: bool = True) -> float:
-    """The factor after innovations that are `std` times as large as stated."""
+    """The factor after innovations of `std` times the stated size."""
     draw, factor = np.random.default_rng(5), VarianceFactor()
     for i in range(round(seconds * rate_hz)):
         innovation, S = std * draw.standard_normal(2), factor.factor * np.eye(2)

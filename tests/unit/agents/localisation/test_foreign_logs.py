@@ -1,4 +1,4 @@
-"""What logs of other machines are like: they begin in motion, have few readings a second, sensors in any order."""
+"""Logs of other machines: start in motion, low rates, any sensor order."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from protocol.machine.readings import Encoder, Imu, Odometry, Reading
 from tests.tiers import by_night
 from tests.unit.agents.drives import LEVER_M, PROJECTION, SITE, START_NS, Drive, Leg, drive, fix
 
-TOUR = (Leg(6, 1.0), Leg(6), *[Leg(12, 0, 0.2), Leg(5), Leg(12, 0, -0.2), Leg(5)] * 2)  # 6 m/s in bends of 30 m
+TOUR = (Leg(6, 1.0), Leg(6), *[Leg(12, 0, 0.2), Leg(5), Leg(12, 0, -0.2), Leg(5)] * 2)  # 6 m/s, bends of 30 m
 GPS, ENCODER, ODOMETRY = (
     SensorConfig("gps", "gps", Mount(LEVER_M)),
     *(SensorConfig("wheels", kind, measures=("speed",)) for kind in ("encoder", "odometry")),
@@ -32,10 +32,7 @@ def cart(*sensors: SensorConfig) -> MachineConfig:
 def readings_of(
     vehicle: MachineConfig, made: Drive, rate_hz: float, seed: int, from_s: float = 0.0, slow_m: float = 1.0
 ) -> list[Reading]:
-    """What its sensors read so many times a second, all at the same stamps.
-
-    Fixes have a white error of 0.5 m per axis and a slow one of slow_m.
-    """
+    """Readings at this rate, equal stamps. Fixes: white error 0.5 m per axis, slow error slow_m."""
     rng, every = np.random.default_rng(seed), round(100 / rate_hz)
     rates = np.gradient(made.heading_rad, 0.01)
     travel = np.cumsum(made.speed_mps) * 0.01
@@ -65,7 +62,7 @@ def readings_of(
 def located(
     vehicle: MachineConfig, readings: Sequence[Reading], engine: str = "ekf"
 ) -> tuple[Positioning, list[PoseBelief], list[Belief]]:
-    """Poses and beliefs as they were known after each reading."""
+    """Poses and beliefs after each reading."""
     config = PipelineConfig(localisation=LocalisationConfig(filter=engine, slip=0.0, slip_soft=0.0))
     positioning, poses, beliefs = Positioning(SITE, vehicle, config), [], []
     for reading in readings:
@@ -78,7 +75,7 @@ def located(
 
 
 def scale_of(positioning: Positioning, belief: Belief) -> tuple[float, float]:
-    """The wheels' scale and its standard deviation."""
+    """Wheel scale, std."""
     state = positioning.localiser._tracker._model.layout.wheel_scales.start
     return float(belief.x[state]), math.sqrt(belief.P[state, state])
 
@@ -126,7 +123,7 @@ IMU, FORCE = SensorConfig("imu", "imu"), SensorConfig("force", "imu", measures=(
         ((IMU,), "default", True),
         ((GYRO,), "default", False),
         ((GYRO, FORCE), "default", True),
-        ((replace(IMU, frame=FRONT),), "default", False),  # nobody knows how it lies against the rear frame
+        ((replace(IMU, frame=FRONT),), "default", False),  # unknown place against the rear frame
         ((replace(IMU, frame=FRONT), JOINT), "default", True),
         ((AHRS,), "paper", True),
         ((replace(AHRS, mode="relative"), GYRO), "default", True),

@@ -1,4 +1,4 @@
-"""Receivers that share their errors: a machine at rest, many draws of what its receivers err, and single faults."""
+"""Receivers with shared errors: machines at rest, many draws, single faults."""
 
 import math
 from collections.abc import Sequence
@@ -44,18 +44,18 @@ from tests.unit.agents.drives import (
 )
 
 SECOND = 1_000_000_000
-STATED_M2 = 4.0  # of a fix: three quarters of it slow
+STATED_M2 = 4.0  # of a fix, three quarters slow
 PLACE_STD_M = 6.0
 ENGINES = {"ekf": Ekf(), "ukf": Ukf()}
 
 
 def at_rest(vehicle: MachineConfig, errors_m: Floats, place_m: Floats, engine: str = "ekf") -> Belief:
-    """What is believed of a machine at rest, by one fix in a second with these errors (n, receivers, 2) each."""
+    """Belief of a machine at rest after one fix a second with these errors (n, receivers, 2)."""
     return each_second(vehicle, errors_m, place_m, engine)[-1]
 
 
 def each_second(vehicle: MachineConfig, errors_m: Floats, place_m: Floats, engine: str = "ekf") -> list[Belief]:
-    """What is believed of it after each of those seconds; no fix comes in where an error is NaN."""
+    """Its belief after each second; NaN: no fix."""
     layout = layout_of(vehicle)
     receivers = Receivers(vehicle.sensors, PROJECTION, layout, slow=True, machine_share=vehicle.machine_share)
     reckoned = localiser(vehicle).dead_reckoning.pose
@@ -104,7 +104,7 @@ def test_the_more_is_shared_the_less_is_known_and_all_shared_is_one_receiver() -
 @pytest.mark.slow
 @pytest.mark.parametrize(("share", "off_m"), by_night([(0.95, 5.0), (None, 40.0)], day=[(None, 40.0)]))
 def test_a_receiver_that_goes_off_for_long_does_not_take_the_place_with_it(share: float | None, off_m: float) -> None:
-    """It is accepted again, as its own error, and once more when it comes back; the others say where the machine is."""
+    """Accepted again as its own error, and once more on return; the others give the place."""
     vehicle = sharing(3, share)
     made = drive([*S_BEND, Leg(18)], vehicle)
     located = localiser(vehicle)
@@ -115,15 +115,15 @@ def test_a_receiver_that_goes_off_for_long_does_not_take_the_place_with_it(share
     assert located.counters["gps-1_relocked"] == located.counters["gps-3_relocked"] == 0
 
 
-# --- a receiver that comes back wrong, or a machine that was carried -------------------------------------------------
+# --- a wrong return, or a moved machine ------------------------------------------------------------------------------
 
 KNOWN_S, GAP_S = 60, 60
-RELOCKED_S = KNOWN_S + GAP_S + TUNING.relock - 1  # index of the second in which the filter accepts them again
+RELOCKED_S = KNOWN_S + GAP_S + TUNING.relock - 1  # second in which the filter accepts them again
 DRIFT_S = SensorConfig("gps-1", "gps").drift_time_s
 
 
 def returning(receivers: int, jumps_m: Floats, seconds: int) -> Floats:
-    """Errors of receivers that are right, silent for a minute, and then off by so much each (receivers, 2)."""
+    """Receivers: right, silent for a minute, then off by jumps_m (receivers, 2)."""
     errors = np.zeros((KNOWN_S + GAP_S + TUNING.relock + seconds, receivers, 2))
     errors[KNOWN_S : KNOWN_S + GAP_S] = np.nan
     errors[KNOWN_S + GAP_S :] = jumps_m
@@ -131,13 +131,13 @@ def returning(receivers: int, jumps_m: Floats, seconds: int) -> Floats:
 
 
 def outside(belief: Belief, place_m: Floats) -> float:
-    """How far a place lies from the believed one, over the 95 % ellipse."""
+    """Distance of a place from belief, over the 95 % ellipse."""
     off = belief.x[:2] - place_m
     return math.sqrt(off @ np.linalg.solve(belief.P[:2, :2], off) / 5.99)
 
 
 def fading(errors_m: Floats) -> Floats:
-    """The same, where what they are off after the gap fades as a slow error does."""
+    """The jump fades like a slow error."""
     errors_m = errors_m.copy()
     seconds = np.arange(len(errors_m) - KNOWN_S - GAP_S)
     errors_m[KNOWN_S + GAP_S :] *= np.exp(-seconds / DRIFT_S)[:, None, None]
@@ -146,7 +146,7 @@ def fading(errors_m: Floats) -> Floats:
 
 @pytest.mark.parametrize(("engine", "jump_m"), [("ekf", 20.0), ("ukf", 60.0)])
 def test_what_a_lone_receiver_is_off_by_is_half_its_own_and_half_the_places(engine: str, jump_m: float) -> None:
-    """As long as nothing says which it was: a variance of J^2 each leaves J^2 / 2 of either, and both are possible."""
+    """Undecided: with variance J^2 each, J^2 / 2 remains of either, and both stay possible."""
     vehicle, jump = sharing(1, None), jump_m * np.array([0.6, 0.8])
     beliefs = each_second(vehicle, returning(1, jump, 1), np.zeros(2), engine)
     assert np.hypot(*beliefs[RELOCKED_S - 1].x[:2]) < 0.1  # refused
@@ -160,7 +160,7 @@ def test_what_a_lone_receiver_is_off_by_is_half_its_own_and_half_the_places(engi
 
 @pytest.mark.slow
 def test_the_motion_shows_within_seconds_which_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error fades against dead reckoning, a place that went wrong stays. The fixes have no noise, but state some."""
+    """An error fades against dead reckoning, a wrong place stays. Fixes are noise-free, but state noise."""
     monkeypatch.setattr(VarianceFactor, "note", lambda *_: None)
     jump_m = 60.0
     jump = jump_m * np.array([0.6, 0.8])
@@ -176,7 +176,7 @@ def test_the_motion_shows_within_seconds_which_it_was(monkeypatch: pytest.Monkey
 @pytest.mark.slow
 @pytest.mark.parametrize(("receivers", "share"), [(3, 0.5), (2, 0.95)])
 def test_receivers_that_come_back_alike_move_the_place_at_once(receivers: int, share: float) -> None:
-    """A machine that was towed, or carried by a ferry."""
+    """A towed or ferried machine."""
     carried = np.array([12.0, -16.0])
     beliefs = each_second(sharing(receivers, share), returning(receivers, carried, 30), np.zeros(2))
     for later_s in (0, 5, 30):
@@ -188,7 +188,7 @@ def test_receivers_that_come_back_alike_move_the_place_at_once(receivers: int, s
 @pytest.mark.slow
 @pytest.mark.parametrize(("share", "engine"), [(0.5, "ukf"), (0.95, "ekf")])
 def test_a_second_receiver_says_at_once_which_it_was(share: float, engine: str) -> None:
-    """It comes back a second after the first is accepted again, and is right, or as far off."""
+    """It returns a second after the first's acceptance, right or as far off."""
     jump = np.array([12.0, -16.0])
     for second in (np.zeros(2), jump):
         errors = returning(2, np.array([jump, second]), 30)
@@ -201,7 +201,7 @@ def test_a_second_receiver_says_at_once_which_it_was(share: float, engine: str) 
             assert outside(belief, second) < 1
 
 
-# --- motion that is wrong: no jump, and nothing that would show whose it was ------------------------------------------
+# --- wrong motion: no jump, unknown cause ----------------------------------------------------------------------------
 
 TURNS = (Leg(4, 1.0), *[Leg(3, 0.0, rate) for rate in (0.3, -0.2, 0.25, -0.35)])  # 16 s
 WRONG_S = 20
@@ -209,7 +209,7 @@ WRONG_S = 20
 
 @pytest.mark.slow
 def test_a_lone_receiver_is_followed_where_the_wheels_are_stuck() -> None:
-    """The encoder still sends, always the same: dead reckoning stands still, and fixes get further and further off."""
+    """A constant encoder: dead reckoning stands still while fixes move away."""
     vehicle = sharing(1, None)
     made = drive([*TURNS, Leg(34)], vehicle)
     stuck = next(r for r in made.readings if isinstance(r, Encoder) and after(r, WRONG_S))
@@ -222,17 +222,17 @@ def test_a_lone_receiver_is_followed_where_the_wheels_are_stuck() -> None:
 
 
 def test_a_receiver_without_a_place_does_not_vote_on_it() -> None:
-    """The filter has gone astray, or the machine was carried: a velocity agrees with either."""
+    """The filter is wrong, or the machine was moved: velocity fits both."""
     vehicle = changed_sensor(sharing(2, None), "gps-2", mode="differential")
     jump = np.array([24.0, -32.0])
     errors = returning(2, jump, 60)
-    errors[:, 1] = 0.0  # heard all the time
+    errors[:, 1] = 0.0  # never silent
     belief = each_second(vehicle, errors, np.zeros(2))[-1]
     assert math.dist(belief.x[:2], jump) < 2.0
 
 
 def test_results_that_could_not_be_computed_say_nothing_of_a_receiver() -> None:
-    """However many there are, errors and places stay finite, and nobody is outvoted by them."""
+    """Errors and places stay finite and nobody is outvoted, however many."""
     vehicle = sharing(2, 0.5)
     receivers = Receivers(vehicle.sensors, PROJECTION, layout_of(vehicle), slow=True, machine_share=0.5)
     belief = Belief(START_NS, np.zeros(layout_of(vehicle).n), np.eye(layout_of(vehicle).n))
@@ -253,7 +253,7 @@ def test_the_share_is_estimated_from_two_absolute_receivers_on_else_as_configure
     readings = thinned(drive([*S_BEND, Leg(30)], vehicle).readings)
     estimated = localiser(vehicle)
     first = estimated.machine_share
-    estimated.run(readings)  # without any error: so they share whatever they state
+    estimated.run(readings)  # error-free, hence shared errors
     assert estimated.machine_share > 0.85 > first
     configured = localiser(replace(vehicle, machine_share=0.3))
     configured.run(readings[:1000])
@@ -267,7 +267,7 @@ def test_the_share_is_estimated_from_two_absolute_receivers_on_else_as_configure
 
 @pytest.mark.slow
 def test_two_right_receivers_outvote_a_wrong_one_that_the_filter_believes() -> None:
-    """Two are away while the third jumps, so that the filter follows it; then they come back."""
+    """Two are silent as the third jumps and the filter follows; then they return."""
     vehicle = sharing(3, 0.5)
     made = drive([*S_BEND, Leg(20)], vehicle)
     away = [r for r in thinned(made.readings) if r.sensor not in ("gps-1", "gps-3") or not after(r, 18) or after(r, 32)]
@@ -277,7 +277,7 @@ def test_two_right_receivers_outvote_a_wrong_one_that_the_filter_believes() -> N
     assert made.off_m(pose) < 4.0
 
 
-# --- velocity by Doppler ----------------------------------------------------------------------------------------------
+# --- velocity by Doppler ---------------------------------------------------------------------------------------------
 
 DOPPLER = SensorConfig("doppler", "gps_velocity", Mount(LEVER_M))
 WITH_DOPPLER = replace(VEHICLE, sensors=(*VEHICLE.sensors, DOPPLER))
@@ -285,7 +285,7 @@ LONG = (*S_BEND, Leg(10), Leg(6, 0, 0.25), Leg(20))
 
 
 def doppler(made: Drive, seed: int = 0, std_mps: float = 0.0, every: int = 20) -> list[GpsVelocity]:
-    """Velocity of the antenna 5 times a second, of a machine on the plane."""
+    """Antenna velocity at 5 Hz on the plane."""
     rng = np.random.default_rng(seed)
     turn = np.gradient(made.heading_rad, TRUE_STEP_S)
     ahead, left = made.speed_mps - turn * LEVER_M[1], turn * LEVER_M[0]
@@ -302,12 +302,12 @@ def merged(*readings: Sequence[Reading]) -> list[Reading]:
 
 
 def silenced(readings: Sequence[Reading], from_s: float) -> list[Reading]:
-    """Without fixes from some time on."""
+    """Without fixes from then on."""
     return [r for r in readings if not (isinstance(r, Gps) and after(r, from_s))]
 
 
 def larger_wheels(readings: Sequence[Reading], scale: float) -> list[Reading]:
-    """Wheels that count too many ticks."""
+    """Too many ticks."""
     return [
         replace(r, left_ticks=r.left_ticks * scale, right_ticks=r.right_ticks * scale) if isinstance(r, Encoder) else r
         for r in readings
@@ -330,7 +330,7 @@ def test_a_stated_error_has_a_least_value_and_a_configured_one_counts_as_it_is()
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_it_holds_the_position_while_fixes_are_away_and_the_wheels_are_wrong() -> None:
-    """A scale that is wrong by a tenth is outside of what the filter takes wheels for before it has seen them."""
+    """A scale error of a tenth is beyond the prior of the wheels."""
     made = drive(LONG, WITH_DOPPLER)
     blind = silenced(larger_wheels(thinned(made.readings), 1.1), 20.0)
     alone = end_error_m(WITH_DOPPLER, made, blind)

@@ -62,7 +62,7 @@ def test_a_mounted_imu_is_turned_into_base_link(rpy_deg: tuple[float, float, flo
 
 
 def articulated(angle_rad: float, rate_radps: float, seconds: float) -> list[FilterStep]:
-    """The rear frame turns at 0.2 rad/s and is pulled ahead by 1 m/s2; the IMU rides on the front frame."""
+    """Rear frame: 0.2 rad/s, 1 m/s2 ahead; the IMU is on the front frame."""
     vehicle = with_imu(Mount((1.0, 0.0, 0.5), (0.0, 0.0, 90.0)), FRONT, (SensorConfig("joint", "articulation"),))
     readings: list[Reading] = []
     for i in range(round(seconds * 100)):
@@ -86,7 +86,7 @@ def test_front_imu_is_turned_by_the_articulation_and_its_rate_taken_off(angle_ra
 
 
 def quaternion(rotation: Floats) -> tuple[float, ...]:
-    """Of a matrix, by its eigenvector of eigenvalue one and its trace: x, y, z, w."""
+    """x, y, z, w from the matrix's trace and eigenvector of eigenvalue one."""
     values, vectors = np.linalg.eig(rotation)
     axis = np.real(vectors[:, np.argmin(np.abs(values - 1))])
     skew = rotation - rotation.T
@@ -138,7 +138,7 @@ def test_what_shows_no_direction_of_the_rear_frame_is_counted_and_not_used(
 
 def test_still_since_the_last_travel() -> None:
     vehicle = MachineConfig("cart", sensors=(WHEELS,))
-    ticks = [*range(20), *[20] * 40, *range(21, 31)]  # a second of driving, two of standing, half of driving
+    ticks = [*range(20), *[20] * 40, *range(21, 31)]  # a second moving, two standing, half moving
     readings = [Encoder("wheels", START_NS + i * 50 * MS, float(t), float(t)) for i, t in enumerate(ticks)]
     still = [step.still_s for step in gather(StepGatherer(vehicle, 0.1), vehicle, readings)]
     assert still[:10] == [0.0] * 10
@@ -148,7 +148,7 @@ def test_still_since_the_last_travel() -> None:
 
 @pytest.mark.parametrize("kind", ["encoder", "odometry"])
 def test_a_step_shows_whether_wheels_were_read(kind: str) -> None:
-    """Silent wheels have no speed, and stand for nothing; ticks show one only once there are enough of them."""
+    """Silent wheels give neither speed nor standstill; ticks give a speed once there are enough."""
     vehicle = with_imu(more=(SensorConfig("w", kind),))
 
     def wheels(ms: int) -> Reading:
@@ -162,7 +162,7 @@ def test_a_step_shows_whether_wheels_were_read(kind: str) -> None:
     assert shown == [False] * settling + [True] * (12 - settling) + [False, False, True, False]
 
 
-# --- what becomes of a step: which measurements, with which deviations and gates --------------------------------------
+# --- from a step to measurements, deviations, gates ------------------------------------------------------------------
 
 STEP = FilterStep(7, DeadReckonedPose(7, 0.0, 0.0, 0.0, 0.0), {}, {}, WheelSpeed(2.0, is_known=True), True, 0.1, 0.0)
 FORCE = np.array([0.06 * GRAVITY_MPS2, 0.0, GRAVITY_MPS2])
@@ -218,7 +218,7 @@ def test_each_sensor_may_have_its_own_gate(gate_sigma: float, expected: float) -
     ("slip", "slip_soft", "speed_mps"), [(0.0, 0.0, 2.0), (0.2, 0.0, 2.0 * 0.98), (0.2, 1.0, 2.0 * (1 - 0.1 * 0.24))]
 )
 def test_slip_of_the_tyres_and_of_soft_ground_is_taken_off(slip: float, slip_soft: float, speed_mps: float) -> None:
-    """Traction of a tenth of the weight, of which 0.06 climb: 0.04 roll."""
+    """Traction of a tenth of the weight: 0.06 climbing, 0.04 rolling."""
     body = sensors(SensorConfig("imu", "imu"), SensorConfig("wheels", "encoder"), slip=slip, slip_soft=slip_soft)
     (wheels,) = body.wheels(IMU_STEP)
     assert wheels.z.tolist() == pytest.approx([speed_mps, 0.0, 0.0])

@@ -38,7 +38,7 @@ def state(located: RunLocaliser) -> Floats:
     return located.belief.x
 
 
-@pytest.mark.parametrize(  # each pair of choices once
+@pytest.mark.parametrize(  # all pairs of choices
     ("receivers", "profile", "engine"),
     [
         (1, "default", "ekf"),
@@ -61,7 +61,7 @@ def test_noiseless_readings_give_a_small_error(receivers: int, profile: str, eng
 
 @pytest.mark.slow
 def test_late_receiver_brings_its_own_unknown_error() -> None:
-    """A second receiver that is 3 m off must not pull the position with the weight of its white noise alone."""
+    """A second receiver 3 m off must count with more than its white noise."""
     vehicle = machine(receivers=2)
     made = drive(S_BEND, vehicle)
     readings = moved([r for r in thinned(made.readings) if r.sensor != "gps-2" or after(r, 20)], 3.0, "gps-2")
@@ -74,7 +74,7 @@ def test_late_receiver_brings_its_own_unknown_error() -> None:
 
 @pytest.mark.slow
 def test_turning_on_the_spot_is_no_gyro_bias() -> None:
-    """An articulated loader that steers at rest turns its rear frame."""
+    """An articulated loader steering at rest turns its rear frame."""
     located = localiser(VEHICLE)
     made = drive([*S_BEND, Leg(4, -0.5), Leg(3, 0.0, 0.1), Leg(1)], VEHICLE, without=("torque",))
     located.run(thinned(made.readings))
@@ -87,7 +87,7 @@ def test_turning_on_the_spot_is_no_gyro_bias() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["ekf", pytest.param("ukf", marks=pytest.mark.nightly)])
 def test_covariance_is_honest(engine: str) -> None:
-    """NEES of a 2-D position is 2 on average where the covariance is right; short runs scatter around it."""
+    """A consistent 2-D position has mean NEES 2; short runs scatter."""
     nees, squares = [], []
     for seed in range(2):
         site, vehicle, readings, track = simulated(seed, 50.0)
@@ -128,7 +128,7 @@ BENDS = (Leg(4, 1.0), *(Leg(3, 0.0, rate) for rate in (0.3, -0.2, 0.25, -0.35, 0
 
 @FILTERS
 def test_without_gps_the_motion_teaches_nothing_that_it_does_not_show(engine: str) -> None:
-    """Forces that are off on one side are neither a turn nor a bias of the gyro; wheels do not show their own scale."""
+    """One-sided force errors are neither turn nor gyro bias; wheels do not show their scale."""
     vehicle = machine(receivers=0)
     made = drive(BENDS, vehicle)
     off = [replace(r, force_y_mps2=r.force_y_mps2 + 0.8) if isinstance(r, Imu) else r for r in made.readings]
@@ -136,7 +136,7 @@ def test_without_gps_the_motion_teaches_nothing_that_it_does_not_show(engine: st
     beliefs = located.run(noisy(off, 1))
     layout = Layout(imus=1, wheel_scale=True)
     assert state(located)[layout.gyro_biases.start : layout.wheel_scales.stop].tolist() == [0.0, 0.0]
-    assert max(map(made.turned_rad, beliefs)) < 0.06  # noise of the gyro, and a step in which it turns at 0.35 rad/s
+    assert max(map(made.turned_rad, beliefs)) < 0.06  # gyro noise and a step at 0.35 rad/s
 
 
 def test_fixes_that_are_refused_are_as_no_gps() -> None:
@@ -160,12 +160,12 @@ def test_without_gps_a_standstill_still_shows_the_gyro_bias() -> None:
     located = localiser(vehicle, start=START)
     beliefs = located.run(biased(made.readings, 0.004))
     assert state(located)[GYRO_BIAS] == pytest.approx(0.004, abs=1e-4)
-    assert made.turned_rad(beliefs[-1]) < 0.25 * 0.004 * 28  # and most of what it turned the machine by
+    assert made.turned_rad(beliefs[-1]) < 0.25 * 0.004 * 28  # most of the wrong turn is undone
 
 
 @pytest.mark.slow
 def test_without_gps_an_unsure_heading_does_not_shorten_the_distance() -> None:
-    """Two minutes straight on: the gyro's bias may have turned the machine by a right angle, most likely it did not."""
+    """Two minutes straight: the gyro bias may mean a right angle, but most likely none."""
     vehicle = machine(receivers=0)
     made = drive([Leg(4, 1.0), Leg(116)], vehicle)
     located = localiser(vehicle, start=START, filter="ukf")

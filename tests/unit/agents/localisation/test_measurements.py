@@ -17,7 +17,7 @@ LEVER_M = np.array([0.8, -0.3, 3.0])
 
 
 def every_kind(layout: Layout) -> list[Measurement]:
-    """One measurement of each kind, of sensors that are not the first of theirs."""
+    """One measurement of each kind, none of the first sensor."""
     augmented = layout is FULL
     return [
         measurements.fix(0, "gps-2", np.zeros(2), np.eye(2), LEVER_M, layout.gps_error(1) if augmented else None, 4.0),
@@ -80,7 +80,7 @@ def imu(rates: Floats, force: Floats, lever_m: Floats | None = None, bias: int |
 
 
 def test_specific_force_is_the_second_derivative_of_the_sensors_path() -> None:
-    """Differences of the position of a point that moves with the body, at constant body rate and acceleration."""
+    """Differences of a body point's position at constant body rate and acceleration."""
     x, lever, h = np.random.default_rng(1).normal(size=PAPER.n) * 0.5, np.array([1.0, -0.5, 2.0]), 1e-4
 
     def turned(t: float) -> Floats:
@@ -99,7 +99,7 @@ def test_specific_force_is_the_second_derivative_of_the_sensors_path() -> None:
 
 @pytest.mark.parametrize("engine", [Ekf(), Ukf()], ids=["ekf", "ukf"])
 def test_orientation_beyond_half_a_turn_is_near(engine: Filter) -> None:
-    """Believed 3.1 rad, measured -3.1 rad: they are 0.08 rad apart, and the mean is half a turn."""
+    """3.1 rad believed, -3.1 rad measured: 0.08 rad apart, mean half a turn."""
     x = np.zeros(PAPER.n)
     x[YAW] = 3.1
     belief = Belief(0, x, np.eye(PAPER.n) * 1e-2)

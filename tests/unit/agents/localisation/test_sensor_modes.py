@@ -1,4 +1,4 @@
-"""Differential and relative sensors, and configured standard deviations."""
+"""Differential and relative sensors; configured standard deviations."""
 
 import math
 from dataclasses import replace
@@ -69,7 +69,7 @@ def test_a_pair_is_the_rate_at_its_middle_and_as_unsure_as_both(
 
 @pytest.mark.parametrize(("hz", "engine"), [(1, "ekf"), (5, "ukf")])
 def test_velocity_of_an_antenna_far_off_the_axle_is_free_of_bias_in_a_bend(hz: int, engine: str) -> None:
-    """At 1 Hz and 0.3 rad/s the mean over a pair is not the velocity at its end: heading and speed must not lag."""
+    """At 1 Hz, 0.3 rad/s a pair's mean differs from the velocity at its end: heading and speed must not lag."""
     vehicle = of_gps("differential")
     vehicle = changed_sensor(vehicle, "gps-1", std={"position": 0.01}, drift_share=0.0)
     made = drive([Leg(4, 0.5), Leg(20, 0.0, 0.3)], vehicle)
@@ -88,7 +88,7 @@ def test_a_first_fix_that_is_too_late_is_no_reference() -> None:
     fixes = [r for r in made.readings if isinstance(r, Gps)]
     others = [r for r in made.readings if not isinstance(r, Gps)]
     cut = next(i for i, r in enumerate(others) if after(r, 20))
-    old = moved(fixes[40:41], 900.0)  # of second 8, and elsewhere
+    old = moved(fixes[40:41], 900.0)  # of second 8, elsewhere
     readings = [*others[:cut], *old, *sorted([*others[cut:], *fixes[100:]], key=lambda r: r.stamp_ns)]
     located = localiser(vehicle, start=START)
     assert max(map(made.off_m, located.beliefs(readings))) < 0.6
@@ -96,7 +96,7 @@ def test_a_first_fix_that_is_too_late_is_no_reference() -> None:
 
 
 def test_a_relative_receiver_does_not_make_a_wrong_start_sure() -> None:
-    """What its first fix says of the place it takes from the belief: that is no news."""
+    """Its first fix takes the place from the belief: no information."""
     vehicle = of_gps("relative")
     made = drive([Leg(5), Leg(4, 0.5), Leg(20)], vehicle)
     stds = [math.sqrt(np.trace(b.P[:2, :2])) for b in localiser(vehicle, start=START).beliefs(thinned(made.readings))]
@@ -105,7 +105,7 @@ def test_a_relative_receiver_does_not_make_a_wrong_start_sure() -> None:
 
 @pytest.mark.slow
 def test_a_restart_takes_a_new_reference() -> None:
-    vehicle = of_gps("relative", receivers=2)  # the absolute one shows where it is after the restart
+    vehicle = of_gps("relative", receivers=2)  # the absolute one gives the place after a restart
     first, second = drive(S_BEND, vehicle), drive(S_BEND, vehicle)
     gap_ns = 1000 * SECOND
     later = [replace(r, stamp_ns=r.stamp_ns + gap_ns) for r in moved(thinned(second.readings), 300.0, "gps-2")]
@@ -124,7 +124,7 @@ def of_ahrs(**options: Any) -> MachineConfig:
 
 @pytest.mark.slow
 def test_a_relative_heading_leaves_a_wrong_start_to_be_corrected_by_fixes() -> None:
-    """The start is 0.1 rad off: the reference is as wrong, and known to be unsure; GPS turns both."""
+    """Start error 0.1 rad: the reference inherits it as uncertainty, and GPS corrects both."""
     vehicle = of_ahrs(mode="relative")
     made = drive([*S_BEND, Leg(40)], vehicle)
     beliefs = localiser(vehicle, start=(10.0, 20.0, 0.76)).beliefs(thinned(with_ahrs(made, 1.0)))
@@ -134,7 +134,7 @@ def test_a_relative_heading_leaves_a_wrong_start_to_be_corrected_by_fixes() -> N
 
 @pytest.mark.slow
 def test_a_configured_position_replaces_what_fixes_state() -> None:
-    """Stated 1.41 m (2 m2): the same number configured is the same belief, whatever is stated."""
+    """Stated 1.41 m (2 m2): the same number configured gives the same belief, whatever is stated."""
     readings = thinned(drive(S_BEND[:4], VEHICLE).readings)
     known = changed_sensor(VEHICLE, "gps-1", std={"position": math.sqrt(2.0)})
     boasting = [replace(r, var_e_m2=1e-4, var_n_m2=1e3) if isinstance(r, Gps) else r for r in readings]
@@ -144,19 +144,19 @@ def test_a_configured_position_replaces_what_fixes_state() -> None:
     assert np.abs(located.P - expected.P).max() < 1e-9
 
 
-# --- absolute headings: slow errors that have states, and what they do without GPS ------------------------------------
+# --- absolute headings: slow error states, also without GPS ----------------------------------------------------------
 
 STATED = math.radians(1.5) ** 2
 LAPS = (Leg(4, 1.0), *([Leg(8), Leg(6, 0.0, 0.25), Leg(5), Leg(6, 0.0, -0.25)] * 4))  # 104 s
 
 
 def until(readings: list[Reading], fixes_s: float) -> list[Reading]:
-    """Fixes up to there, nothing of them afterwards."""
+    """Fixes up to then, none after."""
     return [r for r in thinned(readings) if not (isinstance(r, Gps) and after(r, fixes_s))]
 
 
 def turned(readings: list[Reading], by_rad: float, from_s: float) -> list[Reading]:
-    """The reference off by an angle from a time on."""
+    """The reference with a heading error from then on."""
     c, s = math.cos(by_rad / 2), math.sin(by_rad / 2)
     return [
         replace(r, qz=r.qz * c + r.qw * s, qw=r.qw * c - r.qz * s)
@@ -170,7 +170,7 @@ def turned(readings: list[Reading], by_rad: float, from_s: float) -> list[Readin
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong_deg", [8.0, -25.0])
 def test_an_error_larger_than_stated_is_learnt_and_does_no_harm(wrong_deg: float) -> None:
-    """While fixes show the heading, and in the time without them that follows."""
+    """While fixes show the heading, and later without them."""
     vehicle = of_ahrs()
     made = drive(LAPS, vehicle)
     readings = until(with_ahrs(made, math.radians(wrong_deg), variance=STATED), 60.0)
@@ -184,7 +184,7 @@ def test_an_error_larger_than_stated_is_learnt_and_does_no_harm(wrong_deg: float
 @pytest.mark.slow
 @pytest.mark.parametrize("fixes_s", [pytest.param(1000.0, marks=pytest.mark.nightly), 60.0])
 def test_a_reference_that_jumps_is_refused_then_learnt_anew(fixes_s: float) -> None:
-    """A load of steel beside the sensor: 60 degrees at once, with GPS and without."""
+    """Steel beside the sensor: 60 degrees at once, with and without GPS."""
     vehicle = of_ahrs()
     made = drive(LAPS, vehicle)
     located = localiser(vehicle)
@@ -195,7 +195,7 @@ def test_a_reference_that_jumps_is_refused_then_learnt_anew(fixes_s: float) -> N
 
 
 def test_without_readings_its_error_becomes_what_it_was_at_first() -> None:
-    """Stationary: an error that is known fades, and its variance comes back, in steps of any length."""
+    """Stationary: a known error fades and its variance returns, in steps of any length."""
     layout = Layout(imus=1, references=1)
     error = layout.heading_errors.start
     model = MotionModel(layout, heading_errors=(HeadingError(0.05, 100.0),))

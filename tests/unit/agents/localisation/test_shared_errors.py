@@ -1,4 +1,4 @@
-"""What receivers share, estimated from made-up fixes of a machine that drives in circles."""
+"""Shared receiver errors, estimated from synthetic fixes on circles."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -11,12 +11,12 @@ from protocol.arrays import Floats
 
 SLOW_M2, TIME_S, WHITE_M2, RATE_HZ = 2.7, 45.0, 0.3, 5
 LEVERS_M = np.array([[0.8, 0.0], [0.3, 0.6], [-1.5, -0.6]])
-ROTATION_RAD = 0.8  # of the frame of dead reckoning in `map`
+ROTATION_RAD = 0.8  # of dead reckoning in `map`
 SEED = 11
 
 
 def slow_errors(seed: int, seconds: float, receivers: int, share: float, slow_m2: float = SLOW_M2) -> Floats:
-    """Errors (n, receivers, 2) [m] with this share in common."""
+    """Errors (n, receivers, 2) [m] with this common share."""
     rng, n = np.random.default_rng(seed), round(seconds * RATE_HZ)
     keep = np.exp(-1 / RATE_HZ / TIME_S)
     parts = rng.standard_normal((n, receivers + 1, 2))
@@ -27,7 +27,7 @@ def slow_errors(seed: int, seconds: float, receivers: int, share: float, slow_m2
 
 
 def fixes_of(errors_m: Floats, seed: int = SEED) -> list[SharedFix]:
-    """Fixes of receivers on a machine that drives circles with 2 m/s, each at instants of its own."""
+    """Fixes on circles at 2 m/s, each receiver at its own instants."""
     rng, made = np.random.default_rng(seed + 10_000), []
     white = np.sqrt(WHITE_M2) * rng.standard_normal(errors_m.shape)
     c, s = np.cos(ROTATION_RAD), np.sin(ROTATION_RAD)
@@ -53,7 +53,7 @@ def estimate(fixes: Sequence[SharedFix], receivers: int) -> ShareEstimator:
 @pytest.mark.slow
 @pytest.mark.parametrize("receivers", [2, pytest.param(3, marks=pytest.mark.nightly)])
 def test_over_all_shares_the_mean_is_right_and_better_with_time(receivers: int) -> None:
-    """Of shares drawn as the estimator expects them, the mean of what is left is zero: a law of every posterior."""
+    """With shares drawn from the prior, the mean residual is zero: a law of every posterior."""
     true = np.concatenate([np.zeros(10), (np.arange(10) + 0.5) / 10])
     early, late = [], []
     for seed, share in enumerate(true):
@@ -72,7 +72,7 @@ def test_over_all_shares_the_mean_is_right_and_better_with_time(receivers: int) 
 
 
 def test_outliers_say_nothing() -> None:
-    """A receiver that is far off for a second in eight, or for half a minute; single fixes the filter refuses."""
+    """A receiver far off for a second in eight or half a minute; single fixes refused by the filter."""
     errors = slow_errors(SEED, 180, 2, 0.95)
     plain = estimate(fixes_of(errors), 2).share
     wild = errors.copy()
@@ -84,7 +84,7 @@ def test_outliers_say_nothing() -> None:
 
 
 def test_receivers_that_err_less_than_they_state_share_it_for_all_one_knows() -> None:
-    """The safe side: then several are taken for no better than one."""
+    """The safe side: several then count as one."""
     errors = slow_errors(SEED, 120, 2, 0.0, slow_m2=0.1 * SLOW_M2)
     assert estimate(fixes_of(errors), 2).share > 0.7
     wider = slow_errors(SEED, 180, 2, 0.0, slow_m2=4 * SLOW_M2)

@@ -1,4 +1,4 @@
-"""A machine without an IMU: the turn comes from odometry, else from steering, else from nowhere."""
+"""Machines without IMU: turn rate from odometry, else steering, else none."""
 
 import math
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ from tests.unit.agents.drives import (
 )
 
 WHEELBASE_M = 2.5
-EIGHT = [Leg(6, 0.5), Leg(4), *[Leg(25, 0, 0.25), Leg(25, 0, -0.25)] * 2]  # at 3 m/s, circles of 12 m
+EIGHT = [Leg(6, 0.5), Leg(4), *[Leg(25, 0, 0.25), Leg(25, 0, -0.25)] * 2]  # 3 m/s, circles of 12 m
 BEND = [Leg(6, 0.5), Leg(4), Leg(25, 0, 0.25)]
 DARK_S = 80.0, 90.0
 ERROR = Layout(imus=1).gyro_bias(0)
@@ -42,7 +42,7 @@ def truck(*sensors: SensorConfig) -> MachineConfig:
 
 @dataclass(frozen=True)
 class Wrong:
-    """What the sensors get wrong."""
+    """Sensor errors."""
 
     steering_rad: float = 0.0
     rate_radps: float = 0.0
@@ -52,7 +52,7 @@ class Wrong:
 def driven(
     vehicle: MachineConfig, wrong: Wrong, legs: list[Leg] | None = None, gps_hz: int = 5, seed: int = 0
 ) -> Drive:
-    """With steering and odometry, 20 times a second, and fixes with a slow and a white error."""
+    """Steering and odometry at 20 Hz, fixes with slow and white errors."""
     made, rng = drive(legs or EIGHT, vehicle), np.random.default_rng(seed)
     fixes = [r for r in made.readings if isinstance(r, Gps)][:: 5 // gps_hz]
     slow = np.zeros(2)
@@ -72,7 +72,7 @@ def driven(
 
 
 def run(vehicle: MachineConfig, readings: list[Reading], **options: Any) -> tuple[RunLocaliser, list[Belief]]:
-    """The localiser, and its newest beliefs as they were known."""
+    """The localiser and its newest beliefs."""
     located = localiser(vehicle, **options)
     return located, located.beliefs(readings)
 
@@ -85,7 +85,7 @@ def errors(made: Drive, beliefs: list[Belief], from_s: float = 0.0, to_s: float 
     return [made.off_m(b) for b in beliefs if from_s <= seconds(b) <= to_s]
 
 
-# --- who tells the turn ----------------------------------------------------------------------------------------------
+# --- sources of the turn rate ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def errors(made: Drive, beliefs: list[Belief], from_s: float = 0.0, to_s: float 
         ((STEERING, ODOMETRY, SensorConfig("gyro", "imu", use=False)), "odom"),
         ((STEERING, replace(ODOMETRY, measures=("speed",))), "steer"),
         ((ENCODER, replace(STEERING, use=False)), None),
-        # of several the one that states the least error
+        # the source of the least stated error
         ((ODOMETRY, SURE, replace(SURE, name="a", std={"rate": 0.2})), "b"),
         ((replace(SURE, name="a", std={"rate": 0.2}), ODOMETRY), "a"),
     ],
@@ -127,11 +127,11 @@ def test_old_steering_angle_turns_nothing() -> None:
     readings: list[Reading] = [Steering("steer", START_NS, 0.2)]
     readings += [Encoder("wheels", START_NS + i * 50_000_000, 2.0 * i, 2.0 * i) for i in range(200)]
     reckoning = reckoned(vehicle, readings)
-    turned_m = 2.0 * 39 / 100 * 2 * math.pi * 0.4  # in 2 s
+    turned_m = 2.0 * 39 / 100 * 2 * math.pi * 0.4  # over 2 s
     assert reckoning.angle_rad == pytest.approx(turned_m * math.tan(0.2) / WHEELBASE_M, rel=0.03)
 
 
-# --- what comes of it ------------------------------------------------------------------------------------------------
+# --- results ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -145,7 +145,7 @@ def test_old_steering_angle_turns_nothing() -> None:
 def test_a_machine_without_imu_is_located_and_holds_through_ten_seconds_without_gps(
     sensors: tuple[SensorConfig, ...], wrong: Wrong, gps_hz: int, engine: str
 ) -> None:
-    """GPS errors are 1.6 m rms; in 10 s it drives 30 m and turns by 2.5 rad."""
+    """GPS error 1.6 m rms; in 10 s it moves 30 m and turns 2.5 rad."""
     vehicle, seed = truck(*sensors), 3
     made = driven(vehicle, wrong, gps_hz=gps_hz, seed=seed)
     located, beliefs = run(vehicle, without_fixes(made.readings), filter=engine)
@@ -160,7 +160,7 @@ def test_a_machine_without_imu_is_located_and_holds_through_ten_seconds_without_
 def test_the_error_of_a_turn_is_unsure_at_first_and_that_of_odometry_changes(
     sensors: tuple[SensorConfig, ...], per_s: float
 ) -> None:
-    """A wrong scale makes another error in every bend; an offset of the steering stays."""
+    """A scale error differs by bend; a steering offset stays."""
     vehicle = truck(*sensors)
     located, beliefs = run(vehicle, driven(vehicle, Wrong(), [Leg(1)]).readings, start=(10.0, 20.0, 0.7))
     assert beliefs[0].P[ERROR, ERROR] == pytest.approx(0.02**2, rel=0.01)
@@ -179,7 +179,7 @@ def test_nothing_that_tells_the_turn_is_counted_and_no_crash() -> None:
 
 
 def test_a_step_without_a_turn_leaves_the_rate_to_what_is_known() -> None:
-    """Odometry falls silent in a bend: the rate is soon unknown, not zero."""
+    """Odometry falls silent in a bend: the rate becomes unknown, not zero."""
     vehicle = truck(ENCODER, replace(ODOMETRY, measures=("rate",)))
     made = driven(vehicle, Wrong(fixes=False), [Leg(6, 0.5), Leg(6), Leg(20, 0, 0.25)])
     readings = [r for r in made.readings if not isinstance(r, Odometry) or seconds(r) < 20]

@@ -1,4 +1,4 @@
-"""Drives of machines with known errors over known ground: samples as agents make them, at a thousandth of the cost."""
+"""Drives with known errors over known ground: agents' samples at a thousandth of the cost."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from protocol.arrays import Floats, Table
 from protocol.machine.samples import empty
 
 START_NS = 1_700_000_100_000_000_000
-FOOT_M, TOP_M, SLOPE = 50.0, 74.0, 0.25  # of the ramp, along x
-LATE_M = 4.0  # over which an estimate of c_rr follows a change
-WITHHELD_M = 2.5  # around the ramp's foot and top there are no samples
+FOOT_M, TOP_M, SLOPE = 50.0, 74.0, 0.25  # ramp, along x
+LATE_M = 4.0  # lag of the c_rr estimate after a change
+WITHHELD_M = 2.5  # no samples around the ramp's foot and top
 Site = Callable[[Floats, Floats, Floats], Floats]  # c_rr by place and heading
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Of one machine: zero, scale, lateral zero; from `step_s` on, `step` is added to the zero."""
+    """One machine's zero, scale, lateral zero; from `step_s` on `step` is added to the zero."""
 
     zero: float = 0.0
     scale: float = 0.0
@@ -29,19 +29,18 @@ class Errors:
     step_s: float = np.inf
 
 
-LOW = ((10.0, 10.0), (40.0, 10.0), (40.0, 40.0), (10.0, 40.0))  # closed, on the level
+LOW = ((10.0, 10.0), (40.0, 10.0), (40.0, 40.0), (10.0, 40.0))  # closed, level
 RAMP = ((20.0, 10.0), (110.0, 10.0), (110.0, 40.0), (20.0, 40.0))  # up along y = 10, down along y = 40
 RAMP_AGAIN = ((26.0, 25.0), (104.0, 25.0), (104.0, 40.0), (26.0, 40.0))  # up along y = 25, down with RAMP
-OPEN = ((100.0, 70.0), (900.0, 70.0))  # one lane, there and never back
+OPEN = ((100.0, 70.0), (900.0, 70.0))  # one way only
 
 
 def height_slope(x_m: Floats) -> Floats:
-    """Slope along x."""
     return np.where((x_m > FOOT_M) & (x_m < TOP_M), SLOPE, 0.0)
 
 
 def soils(x_m: Floats, y_m: Floats, _: Floats) -> Floats:
-    """Dirt, with sand in the south-west and gravel in the north-east."""
+    """Dirt, sand in the south-west, gravel in the north-east."""
     return np.where(y_m > 32.0, 0.06, np.where(x_m < 16.0, 0.25, 0.04))
 
 
@@ -59,7 +58,7 @@ def drive(
     late: bool = True,
     start_s: float = 0.0,
 ) -> Table:
-    """Samples of a machine that drives round and round. direction: -1 drives the same track in reverse."""
+    """Samples of laps. direction -1: in reverse."""
     draw = np.random.default_rng(seed)
     points = np.array([*corners, corners[0]] if closed else corners)
     lengths = np.hypot(*np.diff(points, axis=0).T)
@@ -100,7 +99,7 @@ def drive(
 
 
 def _late(values: Floats) -> Floats:
-    """Values that follow a change over LATE_M, as those of an agent's estimator do."""
+    """Values lagging by LATE_M, like an agent's estimate."""
     kept = np.exp(-0.5 / LATE_M * 2)
     out = values.copy()
     for i in range(1, len(out)):
@@ -109,13 +108,13 @@ def _late(values: Floats) -> Floats:
 
 
 def _slow(n: int, std: float, draw: np.random.Generator) -> Floats:
-    """Errors (n, 2) that stay for some 30 m."""
+    """Errors (n, 2) constant over about 30 m."""
     steps = draw.normal(0.0, std, (n // 60 + 2, 2))
     return np.stack([np.interp(np.arange(n) / 60, np.arange(len(steps)), column) for column in steps.T], axis=1)
 
 
 def ledgers(rows: Mapping[str, Table]) -> dict[str, Table]:
-    """Stays of machines by name."""
+    """Stays by machine."""
     out = {}
     for name, table in rows.items():
         ledger = StayLedger()

@@ -1,4 +1,4 @@
-"""What drives of known errors show of these errors, and what they must not show."""
+"""Known errors in drives: found where observable, else not."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ FLEET = {
 
 
 def fleet(site: Site = soils, errors: Mapping[str, Errors] | None = None) -> dict[str, Table]:
-    """Samples of three machines that never reverse."""
+    """Three machines that never reverse."""
     known = errors or {}
     return {
         name: drive(route, known.get(name, own), site=site, seed=i)
@@ -67,7 +67,7 @@ def solve(rows: Mapping[str, Table], excluded: tuple[str, ...] = (), **more: obj
 
 @cache
 def usual() -> Solution:
-    """Of the fleet as it is."""
+    """The unchanged fleet."""
     return solve(fleet())
 
 
@@ -77,7 +77,7 @@ def check(state: MachineErrors, errors: Errors, zero: float = 0.0016, scale: flo
 
 
 def concrete(x_m: Floats, _: Floats, __: Floats) -> Floats:
-    """The same everywhere."""
+    """Uniform."""
     return np.full(len(x_m), 0.008)
 
 
@@ -140,7 +140,7 @@ def test_a_fleet_that_is_off_by_the_same_is_put_right() -> None:
 
 
 def test_without_slopes_nothing_pulls_on_the_scale() -> None:
-    """Nor does a preference for small c_rr, or for smooth ground: on sand it would look like knowledge of the scale."""
+    """Nor do priors for small c_rr or smooth ground: on sand they would resemble a scale."""
     rows = {"a": drive(LOW, Errors(scale=0.08)), "b": drive(LOW, Errors(scale=0.08), seed=1)}
     result = solve(rows)
     assert result.common.std == pytest.approx(SCALE_STD)
@@ -149,7 +149,7 @@ def test_without_slopes_nothing_pulls_on_the_scale() -> None:
 
 
 def test_noise_of_a_machine_is_not_explained_by_its_scale() -> None:
-    """The share of drive force is the common ground's: with the sample's own, noise would be a scale."""
+    """The force share is of the common ground: with the sample's own, noise would seem a scale."""
     rows = fleet()
     draw = np.random.default_rng(5)
     for table in rows.values():
@@ -167,7 +167,7 @@ def test_a_gain_far_beyond_the_data_sheet_is_seen_and_spoils_no_other() -> None:
     assert result.machines["again"].beyond[1] > 10
     check(result.machines["ramp"], FLEET["ramp"][1], scale=0.025)
     own = [each for each in result.corrections if each.machine == "again"]
-    assert own[0].scale == pytest.approx(0.6 / 1.6, abs=0.02)  # k / (1 + k): the measured share has the gain in it
+    assert own[0].scale == pytest.approx(0.6 / 1.6, abs=0.02)  # k / (1 + k): the measured share includes the gain
     right = corrected(rows["again"], own)
     true = drive(RAMP_AGAIN, Errors(), seed=2)
     assert abs(np.median(right["c_rr"] - true["c_rr"])) < 0.003
@@ -180,7 +180,7 @@ def test_a_gain_far_beyond_the_data_sheet_is_seen_and_spoils_no_other() -> None:
 
 
 def test_edges_wait_until_the_estimate_has_followed() -> None:
-    """Nearer to a bend the estimate of c_rr is still on its way, and the scale would seem smaller than it is."""
+    """Near a bend the c_rr estimate still lags, and the scale would seem too small."""
     errors = {"ramp": Errors(scale=0.12), "again": Errors(scale=0.12)}
     result = solve(fleet(errors=errors))
     mean = np.mean([result.machines[name].scale for name in errors])
@@ -188,7 +188,7 @@ def test_edges_wait_until_the_estimate_has_followed() -> None:
 
 
 def test_a_rise_across_withheld_samples_is_not_believed() -> None:
-    """Foot and top of a ramp are round: without samples there, trapezoids see other rises up than down."""
+    """Rounded foot and top: without samples there, trapezoids show different rises up and down."""
     rows = drive(RAMP, Errors(), seed=4)
     x = rows["x_m"]
     up = rows["y_m"] < 25
@@ -220,7 +220,7 @@ def test_an_epoch_in_which_the_zero_steps_states_a_large_deviation() -> None:
 
 def test_a_ramp_that_is_only_ever_climbed_shows_no_scale() -> None:
     rows = drive(RAMP, Errors(scale=0.1))
-    climbed = rows[rows["y_m"] < 25.0]  # the rest is not sampled
+    climbed = rows[rows["y_m"] < 25.0]  # only the climb is sampled
     result = solve({"a": climbed})
     assert not result.common.observed
     assert result.common.reason == "no_slope_both_ways"
@@ -244,7 +244,7 @@ def with_bad(
     off_m: float = 3.0,
     site: Site = soils,
 ) -> dict[str, Table]:
-    """The fleet, and a machine whose torque reads too much and whose antenna lies elsewhere."""
+    """The fleet plus a machine with high torque and a displaced antenna."""
     rows = fleet(site) | {"bad": drive(route, Errors(zero, scale), seed=99, site=site)}
     rows["bad"]["y_m"] += off_m
     return rows
@@ -270,7 +270,7 @@ def test_a_machine_at_fault_has_no_say_though_nobody_said_so(scale: float, zero:
 
 
 def test_of_slopes_that_contradict_each_other_nobody_is_at_fault() -> None:
-    """One machine measures half of its force where few others pass: the doubt must not fall on one of them."""
+    """One machine measures half its force where few others pass: no single one may be blamed."""
     rows = fleet()
     rows["ramp"]["c_rr"] -= 0.5 * (rows["ramp"]["c_rr"] + rows["ramp"]["grade_e"])
     result = solve(rows)

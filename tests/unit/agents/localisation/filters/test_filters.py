@@ -20,7 +20,7 @@ ALL = [*BOTH, PAPER_UKF, SMALL_UKF]
 LAYOUT = Layout(imus=1, wheel_scale=True, receivers=2)
 MODEL = MotionModel(LAYOUT, gps_errors=(GpsError(3.0, 45.0), GpsError(1.5, 20.0)))
 PLANE = replace(MODEL, on_plane=True)
-ANGLES_OF = {1: (0,), 4: (0, 1)}  # of the sensors in the long run
+ANGLES_OF = {1: (0,), 4: (0, 1)}  # of the long-run sensors
 LEVER_M = np.array([0.8, 0.3, 3.0])
 
 
@@ -29,7 +29,7 @@ def name(value: Any) -> str | None:
 
 
 def frozen(values: Any) -> Floats:
-    """An array that nobody can write to, so that a filter which changes its input fails."""
+    """Read-only array: filters must not change inputs."""
     array = np.array(values, dtype=float)
     array.setflags(write=False)
     return array
@@ -50,7 +50,7 @@ def covariance(rng: np.random.Generator, n: int, scale: float = 1.0) -> Floats:
 
 
 def antenna(receiver: int, z: Any, R: Any, **options: Any) -> Measurement:
-    """A GPS fix (east, north) with a lever arm and the receiver's error: not linear in the attitude."""
+    """GPS fix (east, north) with lever arm and receiver error: nonlinear in attitude."""
     error = LAYOUT.gps_error(receiver)
     h = 1e-6
 
@@ -65,12 +65,12 @@ def antenna(receiver: int, z: Any, R: Any, **options: Any) -> Measurement:
 
 
 def pick(states: Any, z: Any, R: Any, **options: Any) -> Measurement:
-    """A measurement of some states as they are."""
+    """Direct measurement of some states."""
     return linear(z, np.eye(LAYOUT.n)[states], R, **options)
 
 
 def definite_enough(P: Floats) -> bool:
-    """Positive definite whatever the units: scaled to ones on the diagonal."""
+    """Positive definite in any units: scaled to a unit diagonal."""
     scale = np.sqrt(np.diag(P))
     return bool(np.linalg.eigvalsh(P / np.outer(scale, scale))[0] > 0)
 
@@ -104,7 +104,7 @@ def test_on_a_linear_model_it_is_the_kalman_filter(kind: Filter) -> None:
 
 
 def small(scale: float) -> tuple[Belief, Motion, list[Measurement]]:
-    """A belief, its motion and measurements, whose standard deviations and innovations all grow with the scale."""
+    """Belief, motion and measurements with standard deviations and innovations of this scale."""
     rng = np.random.default_rng(11)
     x = rng.normal(size=LAYOUT.n)
     x[ATTITUDE] = 0.2, -0.4, 2.0
@@ -129,7 +129,7 @@ def run(kind: Filter, belief: Belief, moves: Motion, measurements: Any) -> Belie
 
 @pytest.mark.parametrize("kind", [Ukf(), PAPER_UKF, Ukf(alpha=0.5, beta=2.0, kappa=0.0)], ids=name)
 def test_its_steps_are_filterpys(kind: Ukf) -> None:
-    """Where filterpy's own weighted sums are well conditioned they are the same, motion and measurement not linear."""
+    """filterpy's sums are well conditioned here; motion and measurement are nonlinear."""
     belief, moves, measurements = small(0.3)
     n = len(belief.x)
     kappa = 3.0 - n if kind.kappa is None else kind.kappa
@@ -152,7 +152,7 @@ def test_its_steps_are_filterpys(kind: Ukf) -> None:
         ({"alpha": 1.0, "beta": 0.9}, "beta"),
         ({"beta": math.inf}, "beta"),
         ({"kappa": math.nan}, "kappa"),
-        ({"kappa": -3.0}, "kappa"),  # too small for a state of two
+        ({"kappa": -3.0}, "kappa"),  # too small for two states
     ],
 )
 def test_bad_option_is_refused_by_name(options: dict[str, float], named: str) -> None:
@@ -160,7 +160,7 @@ def test_bad_option_is_refused_by_name(options: dict[str, float], named: str) ->
         Ukf(**options).condition(believed(np.zeros(2), np.eye(2)), linear([0.0], [[1.0, 0.0]], [[1.0]]))
 
 
-# --- what is refused -------------------------------------------------------------------------------------------------
+# --- refusals --------------------------------------------------------------------------------------------------------
 
 BAD = [
     ([1.0, math.nan], np.eye(2)),
@@ -187,7 +187,7 @@ def test_a_bad_measurement_leaves_the_belief_unchanged(kind: Filter, z: Any, R: 
 
 @pytest.mark.parametrize("kind", BOTH, ids=name)
 def test_the_gate_counts_in_standard_deviations_of_the_innovation(kind: Filter) -> None:
-    """State and measurement of variance 1 each: 3 sigma are 4.24 away."""
+    """State and measurement of variance 1: 3 sigma are 4.24."""
     belief = believed(np.zeros(3), np.eye(3))
     near, far = ([4.2], [4.3])
     assert kind.condition(belief, linear(near, np.eye(3)[:1], [[1.0]], gate_sigma=3.0)).accepted
@@ -207,7 +207,7 @@ def test_the_gate_counts_in_standard_deviations_of_the_innovation(kind: Filter) 
 def test_covariance_stays_symmetric_and_definite_through_dropouts_and_extremes(
     kind: Filter, model: MotionModel
 ) -> None:
-    """Sensors vanish for long stretches, and their covariances are anything between 1e-10 and 1e10."""
+    """Long dropouts; covariances of 1e-10 to 1e10."""
     seed = 7
     rng = np.random.default_rng(seed)
     start = believed(np.zeros(LAYOUT.n), np.diag(10.0 ** rng.uniform(-6, 4, LAYOUT.n)))
@@ -239,7 +239,7 @@ def _any_measurement(sensor: int, rng: np.random.Generator, belief: Belief) -> M
 
 @pytest.mark.parametrize("kind", BOTH, ids=name)
 def test_no_angle_is_less_known_than_to_a_right_angle(kind: Filter) -> None:
-    """A machine that nothing is heard of for a day; what is known of the rest stays finite."""
+    """A day without data; the rest stays finite."""
     belief = believed(np.zeros(LAYOUT.n), np.eye(LAYOUT.n) * 0.01)
     for step in range(1000):
         belief = kind.predict(belief, motion(MODEL, belief, 86.4), step)

@@ -23,7 +23,7 @@ BOTH = pytest.mark.parametrize("engine", [Ekf(), Ukf()], ids=["ekf", "ukf"])
 
 
 def start() -> Belief:
-    """Two metres per second to the north-east."""
+    """2 m/s to the north-east."""
     x = np.zeros(LAYOUT.n)
     x[YAW], x[SPEED] = 0.7, 2.0
     return Belief(START_NS, x, np.eye(LAYOUT.n) * 0.01)
@@ -34,7 +34,7 @@ def fused(engine: Filter | None = None, **options: Any) -> Fusion:
 
 
 def fix(ms: float, east_m: float = 0.0, north_m: float = 0.0, sensor: str = "gps-1", gate: float = 0.0) -> Measurement:
-    """A fix that is so far off the way of an undisturbed drive; its antenna has a lever arm."""
+    """A fix with this offset from an undisturbed drive; lever arm."""
     distance_m = 2.0 * ms / 1000
     position = np.array([distance_m * math.cos(0.7) + east_m, distance_m * math.sin(0.7) + north_m])
     lever = np.array([0.0, 0.0, 3.0])
@@ -53,7 +53,7 @@ def imu(ms: float) -> Measurement:
 
 
 def drive(seed: int, seconds: float = 2.0) -> list[list[Measurement]]:
-    """Noisy groups of measurements: IMU and wheels of one stamp, fixes of two receivers between, at their own."""
+    """Noisy groups: IMU and wheels of one stamp, two receivers' fixes between."""
     rng = np.random.default_rng(seed)
     groups = [[imu(t), wheels(t, 2.0 + rng.normal(scale=0.1))] for t in np.arange(50, seconds * 1000, 50)]
     for sensor, every_ms in (("gps-1", 193), ("gps-2", 311)):
@@ -68,7 +68,7 @@ def same(a: Belief, b: Belief, seed: str = "") -> None:
 
 
 def plainly(engine: Filter, groups: list[list[Measurement]], belief: Belief) -> Belief:
-    """Predict, condition, predict, condition ..."""
+    """Plain filtering, in order."""
     for measurement in itertools.chain(*groups):
         dt_s = (measurement.stamp_ns - belief.stamp_ns) * 1e-9
         if dt_s:
@@ -78,7 +78,7 @@ def plainly(engine: Filter, groups: list[list[Measurement]], belief: Belief) -> 
 
 
 def test_only_a_fix_makes_the_place_unsure_when_it_is_believed_again() -> None:
-    """A velocity (2,) of a differential receiver says nothing of the place."""
+    """A differential receiver's velocity (2,) says nothing of the place."""
     velocity = measurements.velocity(START_NS + 50 * MS, "gps-1", np.array([90.0, 0.0]), np.eye(2), np.zeros(3), 4.0)
     variances = []
     for measurement in (velocity, fix(50, 90.0, gate=4.0)):
@@ -98,7 +98,7 @@ def test_any_order_within_the_window_gives_the_belief_of_plain_filtering(engine:
     seed = 1
     groups = drive(seed)
     rng = np.random.default_rng(seed)
-    # by the time of arrival: each up to 0.4 s late
+    # by arrival, each up to 0.4 s late
     arrival = [group[0].stamp_ns + rng.uniform(0, 400) * MS for group in groups]
     shuffled = [groups[i] for i in np.argsort(arrival)]
     assert [g[0].stamp_ns for g in shuffled] != [g[0].stamp_ns for g in groups]
@@ -148,7 +148,7 @@ def test_a_duplicate_is_refused_and_counted() -> None:
         assert fusion.add([fix(t, 7.0)]) == []
     assert fusion.belief is before
     assert (fusion.counters["duplicate"], fusion.counters["gps-1_used"]) == (2, 3)
-    assert len(fusion.add([fix(300, 1.0), replace(fix(300), sensor="gps-2")])) == 1  # what is new of it counts
+    assert len(fusion.add([fix(300, 1.0), replace(fix(300), sensor="gps-2")])) == 1  # its new part counts
     assert (fusion.counters["duplicate"], fusion.counters["gps-2_used"]) == (3, 1)
 
 
@@ -244,7 +244,7 @@ def test_history_is_no_longer_than_the_window() -> None:
 
 
 def known_anew(belief: Belief) -> Belief:
-    """The position is somewhere else, as if a state had got its first value."""
+    """Another position, like a state's first value."""
     x = belief.x.copy()
     x[POSITION.start] = 40.0
     return replace(belief, x=x)
@@ -252,7 +252,7 @@ def known_anew(belief: Belief) -> Belief:
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 def test_a_change_stays_where_it_was_made(order: tuple[int, ...]) -> None:
-    """It is made before its measurement, however late that comes, and again when what is older comes later."""
+    """Applied before its measurement, however late, and again on older arrivals."""
     steps = [wheels(100), replace(fix(200), change=known_anew), fix(300, 40.0)]
     in_order, fusion = fused(), fused()
     for measurement in steps:

@@ -55,7 +55,7 @@ def test_constant_acceleration_is_exact_on_a_straight_line() -> None:
 
 @pytest.mark.parametrize("pitch", [-1.0, 0.3])
 def test_attitude_follows_the_bodys_rates(pitch: float) -> None:
-    """The rotation matrix turns as dR/dt = R [rate]x, whatever the angles are."""
+    """dR/dt = R [rate]x at all angles."""
     x = somewhere(1, 15, pitch)
     dt = 1e-6
     before, after = (map_from_base(v[ATTITUDE]) for v in (x, driven(x, dt, 1)))
@@ -108,7 +108,7 @@ SHARED = (GpsError(3.0, 45.0, 2.5), GpsError(1.5, 20.0, 0.6))
 
 
 def test_what_receivers_share_moves_both_and_lasts_as_the_covariance_says() -> None:
-    """Their errors stay as wide, and as much alike, as they are; ten short steps equal a long one."""
+    """Variances and correlation are stationary; ten short steps equal a long one."""
     x, errors = np.ones(FULL.n), FULL.gps_errors
     S = np.kron(gps_covariance(SHARED), np.eye(2))
     long, short = (motion(MotionModel(FULL, gps_errors=SHARED), at(x), dt_s) for dt_s in (5.0, 0.5))
@@ -142,7 +142,7 @@ def test_slip_lies_along_and_across_the_body() -> None:
         (lambda: GpsError(math.nan, 1.0), "positive"),
         (lambda: GpsError(1.0, math.inf), "positive"),
         (lambda: GpsError(3.0, 45.0, -0.1), "common_m2"),
-        (lambda: GpsError(3.0, 45.0, 3.0), "common_m2"),  # receivers share no more than they err
+        (lambda: GpsError(3.0, 45.0, 3.0), "common_m2"),  # shared variance above the whole
         (lambda: GpsError(3.0, 45.0, math.nan), "common_m2"),
         (lambda: MotionModel(FULL, gps_errors=ERRORS[:1]), "1 GPS errors for 2 receivers"),
         (lambda: MotionModel(PAPER, heading_errors=(HeadingError(0.05, 100.0),)), "1 heading errors for 0 references"),

@@ -30,7 +30,7 @@ START_NS = 1_767_225_600_000_000_000
 LEVER_M = np.array([0.8, 0.3, 3.0])
 SPEED_MPS, TURN_RADPS = 2.0, 0.15
 BOTH = pytest.mark.parametrize("engine", [Ekf(), Ukf()], ids=["ekf", "ukf"])
-WHOLE_S = 1000.0  # a lag beyond every run here
+WHOLE_S = 1000.0  # longer than every run here
 Groups = list[list[Measurement]]
 
 
@@ -42,7 +42,7 @@ def start(lag_s: float = WHOLE_S, yaw: float = 0.7) -> Belief:
 
 
 def drive(seed: int, seconds: float = 14.0) -> Groups:
-    """Noisy measurements of a machine in a bend."""
+    """Noisy measurements in a bend."""
     rng, R = np.random.default_rng(seed), np.diag([1e-5] * 3 + [1.0] * 3)
     groups: Groups = []
     drift_m = rng.normal(size=2)
@@ -68,7 +68,7 @@ def drive(seed: int, seconds: float = 14.0) -> Groups:
 
 
 def fused(engine: Filter, groups: Groups, belief: Belief | None = None) -> tuple[Fusion, list[SmoothedPose]]:
-    """After all measurements, and the smoothed poses that became final meanwhile."""
+    """Fusion after all measurements, and the final smoothed poses."""
     fusion = Fusion(engine, MODEL, belief or start())
     poses: list[SmoothedPose] = []
     for group in groups:
@@ -78,7 +78,7 @@ def fused(engine: Filter, groups: Groups, belief: Belief | None = None) -> tuple
 
 
 def late(groups: Groups, seed: int) -> Groups:
-    """The same in the order of their arrival, each up to 0.4 s late."""
+    """In order of arrival, each up to 0.4 s late."""
     rng = np.random.default_rng(seed)
     return [groups[i] for i in np.argsort([g[0].stamp_ns + rng.uniform(0, 4e8) for g in groups])]
 
@@ -94,7 +94,7 @@ def same(poses: Sequence[SmoothedPose], others: Sequence[SmoothedPose], toleranc
 
 
 class Augmented:
-    """A Kalman filter whose state holds the past too: copies of what is kept of it, which never move."""
+    """A Kalman filter of the state augmented by kept copies of the past."""
 
     def __init__(self, belief: Belief) -> None:
         self.x, self.P, self.n = belief.x, belief.P, len(belief.x)
@@ -126,7 +126,7 @@ def test_it_is_the_kalman_filter_of_a_state_that_holds_the_past(engine: Filter, 
     reference = Augmented(belief)
     for step in ["move", *steps]:
         M, H = np.eye(n), rng.normal(size=(2, n))
-        if step == "move":  # a second passes, and what was the newest becomes a node
+        if step == "move":  # after a second the newest state becomes a node
             M = 0.9 * M + 0.2 * rng.normal(size=(n, n))
             moves = Motion(lambda x, F=M: x @ F.T, lambda _, F=M: F, np.eye(n) * 0.1, ())
             belief = engine.predict(belief, moves, belief.stamp_ns + 1_000_000_000)
@@ -177,7 +177,7 @@ def test_the_filter_itself_is_the_same_to_the_last_bit_whatever_the_lag(engine: 
 
 
 def test_a_pose_becomes_final_once_with_all_that_was_measured_within_the_lag() -> None:
-    """As known by the newest belief of a run that ends there."""
+    """Equal to the newest belief of a run ending there."""
     groups, lag_s = drive(5), 3.0
     fusion, final = fused(Ekf(), groups, start(lag_s))
     poses = final + fusion.remaining()
@@ -223,7 +223,7 @@ def test_smoothing_never_makes_a_place_less_sure(engine: Filter) -> None:
 
 
 def test_headings_are_smoothed_across_the_back() -> None:
-    """The machine turns past +-180 degrees; corrections stay small, headings in +-pi."""
+    """Across +-180 degrees: small corrections, headings in +-pi."""
     belief, groups = start(4.0, yaw=2.9), []
     for i in range(1, 300):
         stamp = START_NS + i * 50_000_000

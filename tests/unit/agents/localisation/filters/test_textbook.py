@@ -1,4 +1,4 @@
-"""filterpy's filters behind our interface: the same steps as our own, and what happens when they fail."""
+"""filterpy's filters behind our interface: steps equal to ours, and failures."""
 
 import math
 import subprocess
@@ -39,7 +39,7 @@ AHRS = SensorConfig("ahrs", "attitude")
 
 
 class Compared:
-    """A filter that goes on with one's beliefs and keeps the largest difference to the other's, step by step."""
+    """A filter stepping from one's beliefs, noting the largest difference to the other's."""
 
     def __init__(self, stock: Filter, own: Filter) -> None:
         self.difference, self.steps, self.accepted = 0.0, 0, 0
@@ -69,7 +69,7 @@ class Compared:
 def test_each_step_of_a_drive_is_that_of_our_own_filter(
     stock: Filter, own: Filter, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Alignment, turns across +-180 degrees, an attitude reference, fixes with a lever, one of them an outlier."""
+    """Alignment, turns across +-180 degrees, an AHRS, fixes with a lever arm, an outlier."""
     vehicle = machine(receivers=2)
     vehicle = type(vehicle)(**{**vars(vehicle), "sensors": (*vehicle.sensors, AHRS)})
     made = drive(S_BEND[:3], vehicle, heading_rad=3.0)
@@ -91,7 +91,7 @@ def test_what_is_no_number_is_refused(stock: Filter) -> None:
         assert math.isnan(result.nis)
 
 
-NO_COVARIANCE = np.array([[1.0, 2.0], [2.0, 1.0]])  # one eigenvalue is -1
+NO_COVARIANCE = np.array([[1.0, 2.0], [2.0, 1.0]])  # eigenvalue -1
 
 
 @pytest.mark.parametrize("P", [NO_COVARIANCE, np.eye(2) * np.nan, np.diag([-1.0, 1.0])])
@@ -118,14 +118,14 @@ def test_a_filter_that_failed_starts_again_and_is_counted(monkeypatch: pytest.Mo
         positioning.step([reading])
         if positioning.counters["filter_restarts"] and not lost:
             lost = True
-            assert positioning.pose is None  # the start that was configured is far behind by now
+            assert positioning.pose is None  # the configured start is far behind
     assert positioning.counters["filter_restarts"] == 1
     assert made.off_m(positioning.pose) < 0.5
     assert made.turned_rad(positioning.pose) < 0.1
 
 
 class FailsOnce:
-    """A filter whose sums fail at one stamp."""
+    """A filter failing at one stamp."""
 
     def __init__(self, engine: Filter, at_ns: int) -> None:
         self._engine, self._at_ns, self._failed = engine, at_ns, False
@@ -160,6 +160,6 @@ def still(Q: Floats) -> Motion:
 
 
 def seen(z: list[float], R: float = 1.0, gate_sigma: float = 0.0) -> Measurement:
-    """Of the first state."""
+    """The first state."""
     H = np.array([[1.0, 0.0]])
     return Measurement("a", 0, np.array(z), np.array([[R]]), lambda s: s @ H.T, lambda _: H, gate_sigma=gate_sigma)

@@ -1,4 +1,4 @@
-"""Laws of lanes: ground without any tells nothing, a covariance stays one, no place counts twice, a shift shows."""
+"""Laws of lanes: no information without lanes, valid covariances, no place used twice, visible map shifts."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ SQUARE = [(0.0, 0.0, 0.0), (40.0, 0.0, math.pi / 2), (40.0, 40.0, math.pi), (0.0
 
 
 def lane_map(metres):
-    """Lanes of 8 x 8 squares around the origin; metres (16, rows, columns)."""
+    """Lanes around the origin, 8 x 8 squares; metres (16, rows, columns)."""
     planes = SCALE_M.quantised(np.where(metres > 0, metres, np.nan))
     tiles = {
         (x, y): LaneTile(x, y, 1, 9, 2, 3, planes[:, 16 * y + 64 :, 16 * x + 64 :][:, :16, :16].reshape(16, 256))
@@ -41,14 +41,14 @@ def flat(value=5.0):
 
 
 def lane_north(column):
-    """One lane northwards, two cells wide, whose middle is the west edge of a column."""
+    """A northward lane, two cells wide, centred on a column's west edge."""
     metres = np.zeros((16, 128, 128))
     metres[4, :, column + 63 : column + 65] = 10.0
     return lane_map(metres)
 
 
 def straight(count=20):
-    """Way back along a straight drive northwards."""
+    """The way back along a straight northward drive."""
     return np.stack([np.zeros(count), -np.arange(count, dtype=float)], axis=1), np.full(count, math.pi / 2)
 
 
@@ -74,7 +74,7 @@ def test_a_lane_shows_how_far_beside_it_the_machine_seems_to_be(off_m):
     assert isinstance(matched, Match)
     assert matched.place_m[0] == pytest.approx(0.0, abs=0.25)
     assert 1.0 < matched.covariance_m2[0, 0] < 2.0
-    assert matched.covariance_m2[1, 1] > 1000  # along a straight nothing shows
+    assert matched.covariance_m2[1, 1] > 1000  # nothing observable along a straight
 
 
 def test_lanes_that_one_machine_drew_today_are_left_out():
@@ -99,14 +99,14 @@ def test_every_place_is_in_one_window():
             seen += [tuple(place) for place in np.round(back_m + np.array([at.x_m, at.y_m]), 6)]
             assert len(heading) == len(back_m) <= WINDOW_M + 1
             ends += 1
-    assert ends == 19  # the chords of 400 m of arc are a little shorter
+    assert ends == 19  # chords of 400 m of arc are slightly shorter
     assert len(set(seen)) == len(seen)
 
 
 @pytest.mark.parametrize("engine", [Ekf(), Ukf()])
 @pytest.mark.parametrize("tells", [False, True])
 def test_a_thousand_windows(engine, tells):
-    """Of flat ground they change nothing, bit for bit; of lanes they leave a covariance, and the place as it is."""
+    """Flat ground changes no bit; lanes leave a covariance and the same place."""
     aid, model = LaneAid(0.0), MotionModel(LAYOUT)
     aid.lanes = lane_north(0) if tells else flat()
     start = belief_at(stamp_ns=10**9)
@@ -143,13 +143,13 @@ def test_states_that_come_later_leave_the_others_as_they_are():
 
 @pytest.mark.parametrize("engine", [Ekf(), Ukf()])
 def test_the_share_of_lanes_is_how_far_places_go_with_the_map(engine):
-    """Live, and of each place of the past, of a map that is moved east or north by a centimetre."""
+    """Live and smoothed places, the map shifted east or north by 1 cm."""
 
     def driven(moved_m):
         fusion = Fusion(engine, MotionModel(LAYOUT), belief_at())
         for second in range(1, 40):
             place, rest = shown(LAYOUT.n, math.pi / 2), np.eye(LAYOUT.n)[3:15]
-            place[:, -3:] *= second % 3 > 0  # every third one is a fix
+            place[:, -3:] *= second % 3 > 0  # every third is a fix
             z, variance = (moved_m, 1.0) if second % 3 else (np.zeros(2), 4.0)
             still = np.where(np.arange(12) == 2, math.pi / 2, 0.0)
             shown_now = (("place", place, z, np.eye(2) * variance), ("rest", rest, still, np.eye(12) * 1e-4))

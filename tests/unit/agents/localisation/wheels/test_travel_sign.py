@@ -1,4 +1,4 @@
-"""The sign of a speed, by the accelerometer ahead."""
+"""Speed sign by the forward accelerometer."""
 
 import math
 
@@ -14,7 +14,7 @@ STEP_S = 0.05
 def driven(
     *, sign: float, seed: int, seconds: float = 30.0, every_s: float = 0.5, accel_mps2: float = 0.8, grade: float = 0.0
 ) -> TravelSign:
-    """Starts, stops and starts on a hill that steepens, with a cheap accelerometer and Doppler of 0.1 m/s."""
+    """Stop and go on a steepening hill; cheap accelerometer, Doppler of 0.1 m/s."""
     noise, judge, speed, before = np.random.default_rng(seed), TravelSign(), 0.0, 0.0
     for step in range(1, round(seconds / STEP_S)):
         t = step * STEP_S
