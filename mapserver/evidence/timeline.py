@@ -122,7 +122,7 @@ def timed(timelines: Iterable[Timeline | None], tiers: Tiers, space: Space) -> l
     for line in lines:
         if line and line.timed is None:
             line.timed = TimedPages(line.records[0], tiers)
-    return [line.timed if line and line.timed else NO_PAGES for line in lines]
+    return [NO_PAGES if line is None or line.timed is None else line.timed for line in lines]
 
 
 def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
