@@ -104,13 +104,13 @@ class Answers:
             InfoQuery: lambda _: self.info(),
         }
 
-    def start(self) -> None:
-        """Make roads beside the questions from here on, until closed."""
-        self._roads.start()
+    def begin(self) -> None:
+        """See `RoadMaps`."""
+        self._roads.begin()
 
-    def close(self) -> None:
-        """End what is made beside the questions."""
-        self._roads.close()
+    def renew(self) -> float:
+        """See `RoadMaps`."""
+        return self._roads.renew()
 
     @property
     def _reach(self) -> int:
