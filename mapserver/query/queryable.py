@@ -178,6 +178,7 @@ class MapQueryable:
 
     def __init__(self, session: zenoh.Session, key: str, source: MapSource, answers: Answers) -> None:
         self._source, self._answers, self._replies = source, answers, Replies(source)
+
     def __init__(self, name: str, threads: int, budget: int, spare: Callable[[], float] | None = None) -> None:
         """budget: total size of waiting and running tasks. spare: done by one thread while none waits; returns the
         seconds until it is due again.

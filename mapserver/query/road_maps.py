@@ -47,20 +47,11 @@ log = logging.getLogger("mapserver.query.road_maps")
 FRESH_S = 10.0
 # Largest age relative to the last making, 1 % of the time, so that small or new sites get fresh answers.
 CHEAP = 100
-<<<<<<< HEAD
 COSTLY = 20  # least age relative to the last making, so that large maps cost no more than 5 %
 SPARE = 3  # lead before roads are too old, in durations of the last making
 ASKED_S = 600.0  # time after the last question during which roads are made
 PATIENCE_S = 2.0  # longest wait of a picture for the first roads
-END_S = 1.0  # longest wait for a running making on shutdown
 LOOK_BACK_NS = 30 * 24 * HOUR_NS  # traffic before the site's now; older rows are not read
-=======
-COSTLY = 20  # likewise the least: roads of a large map, which take seconds, are older, and take no more than 5 %
-SPARE = 3  # times the last making: so long before roads are too old the next one begins, its own time twice with it
-ASKED_S = 600.0  # so long after the last question roads are still made for the next one
-PATIENCE_S = 2.0  # how long a picture waits for the first roads before it goes without
-LOOK_BACK_NS = 30 * 24 * HOUR_NS  # before the site's now, of traffic: older journals are not read for it
->>>>>>> 71f482cf (Seven kinds of thread: waits for a row and roads are spare work of the threads that answer)
 
 
 @dataclass(frozen=True)
@@ -165,43 +156,18 @@ class RoadMaps:
         self._skeletons = Skeletons(self._cell_m)
         self._newest: _Newest | None = None
         self.made, self.made_s = 0, 0.0
-<<<<<<< HEAD
         self._asked_s = -math.inf  # never
-        self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
-=======
-        self._asked_s = -math.inf  # nobody has
->>>>>>> 71f482cf (Seven kinds of thread: waits for a row and roads are spare work of the threads that answer)
         self._begin("", NO_FACTS)
 
     def _begin(self, store: str, facts: Facts) -> None:
         """Restart following the journal."""
         self._traffic, self._followed, self._with = Traffic(), 0, (store, facts)
 
-<<<<<<< HEAD
-    def start(self) -> None:
-        """Make roads in the background; without this, queries make them.
-
-        An existing map gets roads at once: the first query would wait for its whole journal.
-        """
+    def begin(self) -> None:
+        """Have the first `renew` make roads of an existing map: the first query would wait for its whole journal."""
         with suppress(QueryError):  # a follower without a map yet
             if self._source.run(lambda state: state.version.row):
                 self._ask()
-        self._thread = threading.Thread(target=self._run, name="roads", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Make no more roads."""
-        self._ended.set()
-        if self._thread:
-            self._thread.join(END_S)
-=======
-    def begin(self) -> None:
-        """Have the first `renew` make roads of a map that is there: who asks first would wait for its whole journal."""
-        with suppress(QueryError):  # of a follower, which has no map yet
-            if self._source.run(lambda state: state.version.row):
-                self._ask()
->>>>>>> 71f482cf (Seven kinds of thread: waits for a row and roads are spare work of the threads that answer)
 
     def read(self, as_of_ns: int | None = None, machine: str = "") -> RoadMap:
         """Roads as of a time, or recent ones; machine: only its traffic. Raises QueryError."""
@@ -233,40 +199,18 @@ class RoadMaps:
             log.warning("no road map reason=%s problem=%r", error.reason, str(error))
         return self._newest.roads.ages if self._newest else {}
 
-<<<<<<< HEAD
-    def renew(self) -> None:
-        """Make present roads, unless there were no questions for long."""
-        if self._clock() - self._asked_s < ASKED_S:
-            with _journal_read(), self._lock:
-                self._now()
-
-    def _run(self) -> None:
-        wait_s = 0.0
-        while not self._ended.wait(wait_s):
-            began_s = self._clock()
-            try:
-                self.renew()
-            except QueryError as error:  # queries get the same answer
-                log.info("no road map reason=%s problem=%r", error.reason, str(error))
-            except Exception:  # a bug must not end the thread
-                log.exception("no road map")
-            took_s = self._clock() - began_s
-            # rarely, because all layers near new samples are derived again; at most half of the time
-            wait_s = max(max(FRESH_S, COSTLY * took_s) - SPARE * took_s, took_s)
-=======
     def renew(self) -> float:
-        """Make roads of the map as it is, unless nobody asked for long; returns when to do so again [s from now]."""
+        """Make present roads, unless there were no questions for long; returns seconds until the next time."""
         began_s = self._clock()
         try:
             if began_s - self._asked_s < ASKED_S:
                 with _journal_read(), self._lock:
                     self._now()
-        except QueryError as error:  # who asks is answered so, too
+        except QueryError as error:  # queries get the same answer
             log.info("no road map reason=%s problem=%r", error.reason, str(error))
         took_s = self._clock() - began_s
-        # as seldom as may be, since all layers near a new sample are derived again; and half of the time at most
+        # rarely, because all layers near new samples are derived again; at most half of the time
         return max(max(FRESH_S, COSTLY * took_s) - SPARE * took_s, took_s)
->>>>>>> 71f482cf (Seven kinds of thread: waits for a row and roads are spare work of the threads that answer)
 
     def _lately(self) -> RoadMap:
         """The newest roads, if fresh, or those being made."""
