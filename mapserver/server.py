@@ -96,7 +96,6 @@ class Server:
         self._replies, self._commands = Replies(source), CommandDesk(self._writer, self._upkeep, self.answers.info)
         self._pool = AnswerPool("command", COMMAND_THREADS, MOST_COMMANDS)
         self._queries = MapQueryable(readers, keys.map_queries_all(site.name), source, self.answers)
-        self.answers.start()
         self._queryables = [
             ingest.declare_queryable(keys.ingest_all(site.name), self._on_batch),
             readers.declare_queryable(keys.admin_all(site.name), self._on_command),
@@ -134,7 +133,6 @@ class Server:
             queryable.undeclare()  # type: ignore[no-untyped-call]
         self._queries.stop()
         self._queries.close()
-        self.answers.close()
         self._pool.close()
         self._upkeep.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]

@@ -160,7 +160,7 @@ def _said(pages: Pages, window: CellWindow, known: Ages, config: ServerConfig) -
     """Cells with a value of `changed_s`."""
     out = np.zeros((window.rows, window.columns), np.float32)
     for block, first in valid_pages(pages, CELL_M, config.change, known).items():
-        place(out, window, block, first > 0)
+        place({"changed": out}, window, block, {"changed": first > 0})
     return out > 0
 
 

@@ -41,19 +41,18 @@ def valid_pages(
     Edge cells lack context: pass `reach_blocks` more on every side, and the wanted blocks as `only`. ages: changes
     known otherwise.
     """
-    last = {block: _cuts(block_pages, config, tuning) for block, block_pages in pages.items()}
-    first = {block: last[block].first for block in pages}
-    changed = [block for block in (first if only is None else only) if last[block].has_change]
-    valid = dict(first)
+    last = {block: _cuts(pages[block], config, tuning) for block in (pages if only is None else only)}
+    changed = [block for block, cut in last.items() if cut.has_change]
+    valid = {block: cut.first for block, cut in last.items()}
     reach = reach_blocks(cell_m, config)
     for some in clusters(changed, reach):
         near = {block for one in some for block in around(one, reach) if block in pages}
-        images, corner = _images(Cuts, {block: last[block] for block in near})
+        images, corner = _images(Cuts, {block: _cuts(pages[block], config, tuning) for block in near})
         cells, _ = _images(Known, {block: _known(pages[block], tuning) for block in near})
         holds = credible(images, cells, cell_m, config, tuning)
         for block in some:
-            valid[block] = np.where(cells_of(holds, corner, block), first[block], 0)
-    for block in (ages or {}).keys() & pages.keys():
+            valid[block] = np.where(cells_of(holds, corner, block), valid[block], 0)
+    for block in (ages or {}).keys() & valid.keys():
         valid[block] = np.maximum(valid[block], _since(pages[block], ages[block]))  # type: ignore[index]
     return valid
 
@@ -91,17 +90,19 @@ def clusters(blocks: Iterable[Block], reach: int) -> list[list[Block]]:
 
 
 def _cuts(pages: TimedPages, config: ChangeConfig, tuning: ChangeTuning) -> Cuts:
-    return _derived(pages, (config, tuning), lambda: cuts(pages, config, tuning))
+    return _derived(pages, cuts, (config, tuning), lambda: cuts(pages, config, tuning))
 
 
 def _known(pages: TimedPages, tuning: ChangeTuning) -> Known:
-    return _derived(pages, tuning, lambda: known(pages, tuning))
+    return _derived(pages, known, tuning, lambda: known(pages, tuning))
 
 
-def _derived(pages: TimedPages, key: object, derive: Callable[[], T]) -> T:
-    if key not in pages.derived:
-        pages.derived[key] = derive()
-    value: T = pages.derived[key]
+def _derived(pages: TimedPages, what: object, by: object, derive: Callable[[], T]) -> T:
+    """What `derive` makes, the last time that it was made by this configuration, which is compared and not hashed."""
+    kept = pages.derived.get(what)
+    if kept is None or kept[0] != by:
+        kept = pages.derived[what] = by, derive()
+    value: T = kept[1]
     return value
 
 
@@ -125,8 +126,8 @@ def _images(kind: type[T], blocks: Mapping[Block, T]) -> tuple[T, Block]:
 
 def image_of(blocks: Mapping[Block, AnyArray], nothing: float) -> tuple[AnyArray, Block]:
     """Values (256,) of blocks as one image (rows, columns), and its first block; `nothing` elsewhere."""
-    left, bottom = (min(block[axis] for block in blocks) for axis in (0, 1))
-    right, top = (max(block[axis] for block in blocks) for axis in (0, 1))
+    columns, rows = zip(*blocks, strict=True)
+    left, bottom, right, top = min(columns), min(rows), max(columns), max(rows)
     n, kind = BLOCK_CELLS, next(iter(blocks.values())).dtype
     image = np.full(((top - bottom + 1) * n, (right - left + 1) * n), nothing, kind)
     for (x, y), cells in blocks.items():

@@ -61,12 +61,6 @@ class TimedPages:
         votes_in_time(as_numbers(self.record), votes, ends)
         return votes, ends
 
-    def plane_counts(self, planes: slice) -> Ints:
-        """Counts (planes, 256) of planes, over all pages; a shortcut."""
-        out = np.zeros((planes.stop - planes.start, ev.CELLS), np.int64)
-        sum_planes(as_numbers(self.record), planes.start, out)
-        return out
-
     def older(self, count: int) -> TimedPages:
         """The first pages."""
         pages = Pages.unpacked(self.record)
@@ -122,7 +116,7 @@ def timed(timelines: Iterable[Timeline | None], tiers: Tiers, space: Space) -> l
     for line in lines:
         if line and line.timed is None:
             line.timed = TimedPages(line.records[0], tiers)
-    return [line.timed if line and line.timed else NO_PAGES for line in lines]
+    return [NO_PAGES if line is None or line.timed is None else line.timed for line in lines]
 
 
 def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
@@ -146,6 +140,14 @@ def evidence(pages: Sequence[TimedPages], first: Sequence[Ints] | None = None) -
     for i in np.flatnonzero(start.any(axis=1)).tolist():
         changed_ns[i] = _changed_ns(pages[i], start[i])
     return ev.Evidence(counts, bitmaps, newest_ns, changed_ns)
+
+
+def plane_counts(pages: Sequence[TimedPages], planes: slice) -> Ints:
+    """Counts (blocks, planes, 256) of some planes, of all pages together: quicker than all that there is of them."""
+    out = np.zeros((len(pages), planes.stop - planes.start, ev.CELLS), np.int64)
+    for data, counts in zip([as_numbers(each.record) for each in pages], out, strict=True):
+        sum_planes(data, planes.start, counts)
+    return out
 
 
 def _changed_ns(pages: TimedPages, start: Ints) -> Ints:

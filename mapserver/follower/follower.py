@@ -72,7 +72,6 @@ class Follower:
             raise LinkError(f"follower {name}", f"{self.ended}; choose another --name")
         self._queries = MapQueryable(session, keys.follower_queries(site.name, name), self.source, self.answers)
         self.following.start()
-        self.answers.start()
 
     @property
     def is_shown(self) -> bool:
@@ -104,7 +103,6 @@ class Follower:
         self._queries.stop()
         self.following.stop()
         self._queries.close()
-        self.answers.close()
         self._identity.undeclare()  # type: ignore[no-untyped-call]
         self.following.close()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -27,56 +28,51 @@ class MergeWaits:
     def __init__(self, merged: int) -> None:
         self._merged = merged
         self._waiting: list[_Wait] = []
-        self._next_row: float = float("inf")  # lowest awaited row
-        self._closed = False
-        self._news = threading.Condition()
-        self._thread = threading.Thread(target=self._run, name="waits", daemon=True)
-        self._thread.start()
+        self._next_row: float = math.inf  # lowest awaited row
+        self._lock = threading.Lock()
 
-    def add(self, row: int, wait_s: float, then: Then) -> None:
-        """Call `then` once the row is merged, maybe at once; with an error after wait_s. QueryError if overloaded."""
-        with self._news:
-            if is_waiting := row > self._merged:
-                if len(self._waiting) >= MOST_WAITING:
-                    problem = "too many queries wait for journal rows; ask again later"
-                    raise QueryError(Refusal.OVERLOADED, problem, retry_after_s=2.0)
-                self._waiting.append(_Wait(row, wait_s, time.monotonic() + wait_s, then))
-                self._next_row = min(self._next_row, row)
-                self._news.notify()
-        if not is_waiting:
-            then(None)
+    def add(self, row: int, wait_s: float, then: Then) -> bool:
+        """Have `then` called once the row is merged, or with an error after wait_s; False if it is merged already.
+
+        It is called on the thread that merges or times out, and has to be short. QueryError if too many are waiting.
+        """
+        with self._lock:
+            if row <= self._merged:
+                return False
+            if len(self._waiting) >= MOST_WAITING:
+                problem = "too many queries wait for journal rows; ask again later"
+                raise QueryError(Refusal.OVERLOADED, problem, retry_after_s=2.0)
+            self._waiting.append(_Wait(row, wait_s, time.monotonic() + wait_s, then))
+            self._next_row = min(self._next_row, row)
+            return True
 
     def advance(self, merged: int) -> None:
-        """Note merged rows. Only wakes the thread, because the store's owner has no time."""
-        with self._news:
+        """Note merged rows, and call back whoever waits for them."""
+        with self._lock:
             self._merged = merged
-            if merged >= self._next_row:
-                self._news.notify()
+            due = self._taken(lambda wait: wait.row <= merged) if merged >= self._next_row else []
+        for wait in due:
+            wait.then(None)
+
+    def time_out(self) -> float:
+        """Call back whose wait is over; returns how long until the next one is [s], infinite for none."""
+        with self._lock:
+            now_s = time.monotonic()
+            due = self._taken(lambda wait: wait.deadline_s <= now_s)
+            next_s = min((wait.deadline_s for wait in self._waiting), default=math.inf)
+        for wait in due:
+            problem = f"journal row {wait.row} is not merged after {wait.wait_s:g} s; merged is {self._merged}"
+            wait.then(QueryError(Refusal.AFTER_TIMEOUT, problem))
+        return next_s - now_s
 
     def close(self) -> None:
         """Drop all waits."""
-        with self._news:
-            self._closed = True
-            self._waiting.clear()
-            self._news.notify()
-        self._thread.join()
+        with self._lock:
+            self._waiting, self._next_row = [], math.inf
 
-    def _run(self) -> None:
-        while (due := self._next_due()) is not None:
-            for wait in due:
-                problem = f"journal row {wait.row} is not merged after {wait.wait_s:g} s; merged is {self._merged}"
-                wait.then(None if wait.row <= self._merged else QueryError(Refusal.AFTER_TIMEOUT, problem))
-
-    def _next_due(self) -> list[_Wait] | None:
-        """Block until some waits are over, and take them; None at the end."""
-        with self._news:
-            while not self._closed:
-                now_s = time.monotonic()
-                due = [wait for wait in self._waiting if wait.row <= self._merged or wait.deadline_s <= now_s]
-                if due:
-                    self._waiting = [wait for wait in self._waiting if wait not in due]
-                    self._next_row = min((wait.row for wait in self._waiting), default=float("inf"))
-                    return due
-                deadline_s = min((wait.deadline_s for wait in self._waiting), default=None)
-                self._news.wait(deadline_s and max(0.0, deadline_s - now_s))
-        return None
+    def _taken(self, is_due: Callable[[_Wait], bool]) -> list[_Wait]:
+        due = [wait for wait in self._waiting if is_due(wait)]
+        if due:
+            self._waiting = [wait for wait in self._waiting if not is_due(wait)]
+            self._next_row = min((wait.row for wait in self._waiting), default=math.inf)
+        return due

@@ -26,7 +26,7 @@ from mapserver.query.road_maps import RoadMaps
 from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource, MapState
 from mapserver.query.views import PastMaps, StillMap, View, check_past, read_lanes, view_now, widened
-from protocol.arrays import Floats32, Ints
+from protocol.arrays import Floats, Floats32, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.answers import (
@@ -104,13 +104,13 @@ class Answers:
             InfoQuery: lambda _: self.info(),
         }
 
-    def start(self) -> None:
-        """Make roads beside the questions from here on, until closed."""
-        self._roads.start()
+    def begin(self) -> None:
+        """See `RoadMaps`."""
+        self._roads.begin()
 
-    def close(self) -> None:
-        """End what is made beside the questions."""
-        self._roads.close()
+    def renew(self) -> float:
+        """See `RoadMaps`."""
+        return self._roads.renew()
 
     @property
     def _reach(self) -> int:
@@ -155,28 +155,31 @@ class Answers:
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
-        cell, names = self._cell(query.x_m, query.y_m), _names(query)
-        if not query.reads_past and (kept := self._source.run(lambda state: self._kept_point(state, cell, names))):
+        names, place = _names(query), np.array([(query.x_m, query.y_m)])
+        if not query.reads_past and (kept := self._source.run(lambda state: self._kept_point(state, place, names))):
             return kept
-        region = self._read(self._reading(cell, names, query), cell)
-        values = {name: float(layer[0, 0]) for name, layer in region.layers.items()}
-        return PointAnswer(float(region.x_m[0]), float(region.y_m[0]), values, region.version, region.stamp_ns)
+        one = self._at(place, names, query)
+        values = {name: float(layer[0]) for name, layer in one.layers.items()}
+        return PointAnswer(float(one.x_m[0]), float(one.y_m[0]), values, one.version, one.stamp_ns)
 
-    def _kept_point(self, state: MapState, cell: CellWindow, names: tuple[str, ...]) -> PointAnswer | None:
+    def _kept_point(self, state: MapState, place: Floats, names: tuple[str, ...]) -> PointAnswer | None:
         """Layers of a cell of the map as it is, where they are kept."""
-        values = self._layers.kept_cell(state, (cell.column, cell.row), names)
+        (cell,) = self._site.geometry.cell_of(place)
+        values = self._layers.kept_cell(state, tuple(cell.tolist()), names)
         if values is None:
             return None
-        x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
+        x_m, y_m = ((cell + 0.5) * self._site.cell_m).tolist()
         return PointAnswer(x_m, y_m, values, state.version, state.newest_ns)
 
     def points(self, query: PointsQuery) -> PointsAnswer:
         """Layers of the cells that positions lie in."""
-        names, places = _names(query), np.array(query.places)
+        return self._at(np.array(query.places), _names(query), query)
+
+    def _at(self, places: Floats, names: tuple[str, ...], query: Compared[Any]) -> PointsAnswer:
+        """Layers of the cells that places (n, 2) lie in, less those of another time where the query says so."""
         cells = self._site.geometry.cell_of(places)
-        times, repairs = query.times, query.repairs
-        newer, *others = (self._look_at_cells(cells, names, as_of_ns, repairs=repairs) for as_of_ns in times)
-        layers, look = {name: newer[0][name] for name in names}, newer[1]
+        looks = (self._look_at_cells(cells, names, as_of_ns, repairs=query.repairs) for as_of_ns in query.times)
+        (layers, look), *others = looks
         version = look.version
         for older, its_look in others:
             layers = {name: values - older[name] for name, values in layers.items()}
@@ -268,8 +271,8 @@ class Answers:
         return self._source.run(lambda state: state.version)
 
     def _cell(self, x_m: float, y_m: float) -> CellWindow:
-        window = self._site.geometry.window(Bounds(x_m, y_m, np.nextafter(x_m, np.inf), np.nextafter(y_m, np.inf)))
-        return CellWindow(window.column, window.row, 1, 1)
+        column, row = self._site.geometry.cell_of(np.array([x_m, y_m])).tolist()
+        return CellWindow(column, row, 1, 1)
 
     def _window(self, query: RegionQuery) -> tuple[CellWindow, int]:
         """The answer's cells, and map cells to a side."""

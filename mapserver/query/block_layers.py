@@ -14,8 +14,9 @@ import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import count, product
+from typing import NamedTuple
 from weakref import ReferenceType, ref
 
 import cv2
@@ -48,8 +49,7 @@ State = tuple[int, bytes]
 NO_AGES = b""
 
 
-@dataclass(frozen=True)
-class Kept:
+class Kept(NamedTuple):
     """Layers of one block or square, the state in which they are good, and what they were derived from.
 
     origin: of a block, its own last turn, and where its pages begin to count (256,), empty for all of them; of a
@@ -109,12 +109,12 @@ class BlockLayers:
         turn = max(state.grid.last_turns(around(block, self._reach)))
         with self._lock:
             kept = self._cells.get(block) if self._grid and self._grid() is state.grid else None
-            if kept is None or kept.state != (turn, NO_AGES) or any(name not in kept.layers for name in names):
+            if kept is None or kept.state != (turn, NO_AGES) or any(TIMED.get(n, n) not in kept.layers for n in names):
                 return None
             self._cells.move_to_end(block)
             self.used += 1
         at = row % n * n + column % n
-        return {name: float(kept.layers[name][at]) for name in names}
+        return {name: float(np.float32(_at(kept.layers, name, state.newest_ns)[at])) for name in names}
 
     def look_squares(self, state: MapState | StillMap, squares: Set[Block], names: Sequence[str]) -> Look:
         """Sources of area layers in squares."""
@@ -128,11 +128,7 @@ class BlockLayers:
         """Sources of these layers of blocks, and of area layers in their squares."""
         area_names = _areas_of(names)
         squares = {(x // SQUARE, y // SQUARE) for x, y in blocks} if area_names else set[Block]()
-        (left, bottom), (right, top) = (
-            tuple(side(block[axis] for block in blocks) for axis in (0, 1)) for side in (min, max)
-        )
-        rect = (left, bottom, right - left + 1, top - bottom + 1)
-        return self._look(state, rect, _stored(names), squares, area_names, blocks)
+        return self._look(state, _around_all(blocks), _stored(names), squares, area_names, blocks)
 
     def _look(
         self,
@@ -196,13 +192,11 @@ class BlockLayers:
         blocks = _within(look.cell_states, inner) if cell_names else ()
         cells = self.blocks(look, blocks, cell_names)
         out: dict[str, Floats32] = {name: np.full((window.rows, window.columns), np.nan, np.float32) for name in names}
-        for name, layer in out.items():
-            if name in AREA_LAYERS:
-                for square, kept in areas.items():
-                    place_square(layer, window, square, kept[name])
-            else:
-                for block, of_cells in cells.items():
-                    place(layer, window, block, _at(of_cells.layers, name, look.stamp_ns))
+        for square, layers in areas.items():
+            place_square(out, window, square, {name: layers[name] for name in area_names})
+        plain = [name for name in names if name not in AREA_LAYERS]
+        for block, kept in cells.items():
+            place(out, window, block, {name: _at(kept.layers, name, look.stamp_ns) for name in plain})
         return out
 
     def at_cells(self, look: Look, cells: Ints, names: Sequence[str]) -> dict[str, Floats32]:
@@ -276,12 +270,12 @@ class BlockLayers:
         missing = [block for block in blocks if block not in cells]
         near = {one for block in missing for one in around(block, self._reach) if one in look.pages}
         pages = {block: look.pages[block] for block in sorted(near)}
-        first = valid_pages(pages, self.cell_m, self._config.change, look.ages)
+        first = valid_pages(pages, self.cell_m, self._config.change, look.ages, only=missing)
         made: dict[Block, Kept] = {}
         for block in missing:
             old, origin = known.get(block), (look.turns[block], *_beginning(first[block]))
             same = old if old and old.origin == origin else Kept(blocks[block], {}, origin, next(self._numbers))
-            made[block] = replace(same, state=blocks[block])
+            made[block] = same._replace(state=blocks[block])
         lacking = [block for block in missing if any(name not in made[block].layers for name in names)]
         for some in chunks(lacking):
             sums = evidence([look.pages[block] for block in some], [first[block] for block in some])
@@ -291,7 +285,7 @@ class BlockLayers:
                 values[name] = np.where(np.isnan(values["weight"]), 0, getattr(sums, name))
             for i, block in enumerate(some):
                 more = {name: layer[i].copy() for name, layer in values.items()}  # a view would keep all of them
-                made[block] = replace(made[block], layers={**made[block].layers, **more})
+                made[block] = made[block]._replace(layers={**made[block].layers, **more})
         self._keep(self._cells, look, made)
         self._note(len(blocks) - len(lacking), len(lacking))
         return cells | made
@@ -310,8 +304,7 @@ class BlockLayers:
         needs = {name: np.full(shape, np.nan, np.float32) for name in cell_layers.required(names)}
         for near in self._around([square], names):
             if kept := cells.get(near):
-                for name, layer in needs.items():
-                    place(layer, wide, near, kept.layers[name])
+                place(needs, wide, near, {name: kept.layers[name] for name in needs})
         made = cell_layers.derive_area(names, needs, self.cell_m, self._config.read)
         inside = slice(reach, reach + edge)
         return {name: np.ascontiguousarray(layer[inside, inside]) for name, layer in made.items()}
@@ -330,8 +323,9 @@ class BlockLayers:
                 if old and old.state[0] > kept.state[0]:
                     continue
                 layers = {**old.layers, **kept.layers} if old and old.state == kept.state else kept.layers
-                self._count += _size(layers) - (_size(old.layers) if old else 0)
-                store[block] = replace(kept, layers=layers)
+                if not old or layers is not old.layers:
+                    self._count += _size(layers) - (_size(old.layers) if old else 0)
+                store[block] = kept._replace(layers=layers)
                 store.move_to_end(block)
             while self._count > self._most:
                 fuller = self._areas if SQUARE**2 * len(self._areas) > len(self._cells) else self._cells
@@ -442,9 +436,14 @@ def squares_of(window: CellWindow) -> set[Block]:
 
 def around_squares(squares: Set[Block]) -> CellWindow:
     """The window of squares."""
-    left, bottom = (min(square[axis] for square in squares) for axis in (0, 1))
-    right, top = (max(square[axis] for square in squares) for axis in (0, 1))
-    return _cells_of(_of_squares((left, bottom, right - left + 1, top - bottom + 1)))
+    return _cells_of(_of_squares(_around_all(squares)))
+
+
+def _around_all(blocks: Iterable[Block]) -> Rect:
+    """The rectangle that has all of these blocks or squares."""
+    columns, rows = zip(*blocks, strict=True)
+    left, bottom = min(columns), min(rows)
+    return left, bottom, max(columns) - left + 1, max(rows) - bottom + 1
 
 
 def _squares_of(blocks: Rect) -> Rect:
@@ -530,6 +529,6 @@ def _by_square(image: Floats, rect: Rect, squares: Set[Block]) -> dict[Block, in
     return {square: turn for square, turn in turns.items() if turn > NEVER}
 
 
-def place_square(out: Floats32, window: CellWindow, square: Block, values: AnyArray) -> None:
-    """Copy a square's values (64, 64) into a window."""
-    place(out, window, (square[0] * SQUARE, square[1] * SQUARE), values)
+def place_square(out: Mapping[str, Floats32], window: CellWindow, square: Block, layers: Layers) -> None:
+    """Copy layers (64, 64) of a square into those of a window."""
+    place(out, window, (square[0] * SQUARE, square[1] * SQUARE), layers)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import product
 from weakref import ReferenceType, ref
 
 import numpy as np
@@ -19,21 +20,48 @@ from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import Ages, around
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import Block
-from mapserver.query.block_layers import NEVER, SQUARE, BlockLayers, Kept, Look
+from mapserver.query.block_layers import SQUARE, BlockLayers, Kept, Look
 from mapserver.query.region_pieces import PIECE_BYTES
 from mapserver.query.source import MapSource, MapState
 from mapserver.query.views import StillMap, View
+from protocol.arrays import Ints
 from protocol.queries.answers import MapVersion
-from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer, TilesQuery
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, Plane, TilesAnswer, TilesQuery
 from protocol.site.geometry import BLOCK_CELLS
 
 LAYERS = (*list(PLANES)[:-1], "newest_ns")  # which `since` follows from
 AT_ONCE = 64  # tiles that are looked at together: 1024 blocks, which take whoever owns the map some 10 ms
 TILE_HEAD_BYTES = 64  # of a tile beside its planes, at most
+NOTHING = MapVersion("", 0, -1)
 Place = tuple[int, int]  # column and row of a tile
-Blocks = list[Kept | None]  # of a tile, row by row; None without evidence
-Numbers = tuple[int, ...]  # theirs
-NOTHING: Numbers = (NEVER,) * SQUARE**2
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A tile in the making: planes (planes, 64, 64), and the newest stamps (64, 64), 0 for none."""
+
+    planes: Plane = field(default_factory=lambda: np.zeros((len(PLANES), TILE_CELLS, TILE_CELLS), np.uint8))
+    newest_ns: Ints = field(default_factory=lambda: np.zeros((TILE_CELLS, TILE_CELLS), np.int64))
+
+    def tile(self, place: Place, version: MapVersion) -> MapTile:
+        """The tile as it is drawn."""
+        newest = int(self.newest_ns.max())
+        since_s = np.where(self.newest_ns > 0, (newest - self.newest_ns) / 1e9, np.nan)
+        self.planes[-1] = PLANES["since"].quantised(since_s)
+        return MapTile(*place, version.row, version.fact, newest, zlib.compress(self.planes.tobytes()))
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What is drawn: of a turn of a grid, a version, with ages; and the number of what each block is drawn from."""
+
+    turn: int = -1
+    grid: ReferenceType[Grid] | None = None  # a fact may bring another one
+    version: MapVersion = NOTHING
+    ages: Ages = field(default_factory=dict)
+    marks: dict[object, bytes] = field(default_factory=dict)
+    numbers: dict[Block, int] = field(default_factory=dict)
+    drawings: dict[Place, Drawing] = field(default_factory=dict)
 
 
 class Tiles:
@@ -45,11 +73,8 @@ class Tiles:
         self._cell_m = source.site.cell_m
         self._reach = reach_blocks(self._cell_m, source.config.change)
         self._lock = threading.Lock()
-        self._tiles: dict[Place, tuple[Numbers, MapTile]] = {}
-        self._turn, self._fact, self._row = -1, -1, 0
-        self._ages: Ages = {}
-        self._marks: dict[object, bytes] = {}
-        self._grid: ReferenceType[Grid] | None = None  # the last one; a fact may bring another one
+        self._tiles: dict[Place, MapTile] = {}
+        self._drawn = _Drawn()
 
     def answer(self, query: TilesQuery) -> TilesAnswer:
         """Tiles that differ since the version that the query names; all where it names none of this store."""
@@ -59,45 +84,51 @@ class Tiles:
             whole = (
                 since is None or since.store != version.store or since.row > version.row or since.fact > version.fact
             )
-            tiles = tuple(tile for _, tile in self._tiles.values() if whole or _is_newer(tile, since))
+            tiles = tuple(tile for tile in self._tiles.values() if whole or _is_newer(tile, since))
             return cut(TilesAnswer(version, stamp_ns, self._cell_m, whole, tiles), query.place)
 
     def _update(self) -> tuple[MapVersion, int]:
-        """Make anew what evidence came into, and what lies so near that a change of the ground there counts for it."""
+        """Draw anew what evidence came into, and what lies so near that a change of the ground there counts for it.
+
+        Whatever fails on the way is drawn with the next question: what is drawn is noted at the end.
+        """
         ages = self._lately()
-        places, whole, version, stamp_ns = self._source.run(lambda state: self._changed(state, ages))
-        if version.row < self._row:  # rows are gone: what was said of them differs from no version
+        places, drawn, stamp_ns = self._source.run(lambda state: self._changed(state, ages))
+        if drawn.version.row < self._drawn.version.row:  # rows are gone: what was said of them differs from no version
             self._tiles = {}
+        whole = drawn.drawings is not self._drawn.drawings
         for some in _few(sorted({*places, *(self._tiles if whole else ())})):
-            look = self._source.run(lambda state: self._look(state, some))  # noqa: B023 # called at once
-            for place, blocks in of_tiles(self._layers, look, some):
-                numbers = tuple(block.number if block else NEVER for block in blocks)
-                known, tile = self._tiles.get(place, (NOTHING, None))
-                if numbers == known:
-                    continue
-                made = tile_of(place, blocks, version)
+            look = self._source.run(lambda state: self._look(state, some, drawn))  # noqa: B023 # called at once
+            blocks = of_tiles(self._layers, look, some)
+            others = {block: kept for block, kept in blocks.items() if drawn.numbers.get(block) != kept.number}
+            gone = {place: drawn.drawings.setdefault(place, Drawing()) for place in (some if whole else ())}
+            for place, drawing in (gone | draw(drawn.drawings, others)).items():
+                known, made = self._tiles.get(place), drawing.tile(place, drawn.version)
                 # what evidence came into is another one, though its bytes are not: `Client.watch` reads finer values
-                is_same = whole and tile and (tile.newest_ns, tile.planes) == (made.newest_ns, made.planes)
-                self._tiles[place] = numbers, tile if tile and is_same else made
-        self._fact, self._row = version.fact, version.row
-        return version, stamp_ns
+                if not (whole and known and (known.newest_ns, known.planes) == (made.newest_ns, made.planes)):
+                    self._tiles[place] = made
+            drawn.numbers.update((block, kept.number) for block, kept in others.items())
+        self._drawn = drawn
+        return drawn.version, stamp_ns
 
-    def _changed(self, state: MapState, ages: Ages) -> tuple[set[Place], bool, MapVersion, int]:
-        """Tiles that may be others, and whether those are all."""
-        grid, known_grid = state.grid, self._grid and self._grid()
-        whole = state.version.fact != self._fact or grid is not known_grid
+    def _changed(self, state: MapState, ages: Ages) -> tuple[set[Place], _Drawn, int]:
+        """Tiles that may be others, and what they are to be drawn from."""
+        grid, last = state.grid, self._drawn
+        whole = state.version.fact != last.version.fact or last.grid is None or last.grid() is not grid
+        folded, turn = grid.folded_since(-1 if whole else last.turn)
+        drawn = replace(last, turn=turn, grid=ref(grid), version=state.version)
         aged: list[Block] = []
-        if whole or state.version.row != self._row:
-            aged = [block for block in ages.keys() | self._ages.keys() if not _is_same(ages, self._ages, block)]
-            if ages is not self._ages:
-                self._ages, self._marks = ages, {}
-        folded, self._turn = grid.folded_since(-1 if whole else self._turn)
-        self._grid = ref(grid)
+        if whole or state.version.row != last.version.row:
+            aged = [block for block in ages.keys() | last.ages.keys() if not _is_same(ages, last.ages, block)]
+            if ages is not last.ages:
+                drawn = replace(drawn, ages=ages, marks={})
+        if whole:
+            drawn = replace(drawn, numbers={}, drawings={})
         near = folded if whole else [*aged, *(one for block in folded for one in around(block, self._reach))]
-        return {_tile_of(block) for block in near}, whole, state.version, state.newest_ns
+        return {_tile_of(block) for block in near}, drawn, state.newest_ns
 
-    def _look(self, state: MapState, places: Iterable[Place]) -> Look:
-        aged = StillMap(state.grid, state.version, state.newest_ns, self._ages, self._marks)
+    def _look(self, state: MapState, places: Iterable[Place], drawn: _Drawn) -> Look:
+        aged = StillMap(state.grid, state.version, state.newest_ns, drawn.ages, drawn.marks)
         return self._layers.look_blocks(aged, {block for place in places for block in _blocks(place)}, LAYERS)
 
 
@@ -112,33 +143,34 @@ def _tile_of(block: Block) -> Place:
 
 def _blocks(place: Place) -> list[Block]:
     """Blocks of a tile."""
-    return [(SQUARE * place[0] + x, SQUARE * place[1] + y) for y in range(SQUARE) for x in range(SQUARE)]
+    return [(SQUARE * place[0] + x, SQUARE * place[1] + y) for x, y in product(range(SQUARE), repeat=2)]
 
 
 def _is_same(some: Ages, others: Ages, block: Block) -> bool:
     return block in some and block in others and bool((some[block] == others[block]).all())
 
 
-def of_tiles(layers: BlockLayers, look: Look, places: Iterable[Place]) -> Iterator[tuple[Place, Blocks]]:
-    """The blocks of tiles."""
-    known = layers.blocks(look, [block for place in places for block in _blocks(place)], LAYERS)
-    return ((place, [known.get(block) for block in _blocks(place)]) for place in places)
+def of_tiles(layers: BlockLayers, look: Look, places: Iterable[Place]) -> dict[Block, Kept]:
+    """The blocks of tiles that have evidence."""
+    return layers.blocks(look, [block for place in places for block in _blocks(place)], LAYERS)
 
 
-def tile_of(place: Place, blocks: Blocks, version: MapVersion) -> MapTile:
-    """A tile of layers of its blocks."""
-    shape = (SQUARE, BLOCK_CELLS, SQUARE, BLOCK_CELLS)  # row and column of a cell, each by block
-    values, newest_ns = np.full((len(PLANES), *shape), np.nan), np.zeros(shape, np.int64)
-    for i, block in enumerate(blocks):
-        if block:
-            y, x = divmod(i, SQUARE)
-            newest_ns[y, :, x] = block.layers["newest_ns"].reshape(BLOCK_CELLS, BLOCK_CELLS)
-            for plane, name in enumerate(LAYERS[:-1]):
-                values[plane, y, :, x] = block.layers[name].reshape(BLOCK_CELLS, BLOCK_CELLS)
-    newest = int(newest_ns.max())
-    values[-1] = np.where(newest_ns > 0, (newest - newest_ns) / 1e9, np.nan)
-    planes = np.stack([scale.quantised(plane) for scale, plane in zip(PLANES.values(), values, strict=True)])
-    return MapTile(*place, version.row, version.fact, newest, zlib.compress(planes.tobytes()))
+def draw(drawings: dict[Place, Drawing], blocks: Mapping[Block, Kept]) -> dict[Place, Drawing]:
+    """Draw blocks; returns the drawings that they are of."""
+    drawn: dict[Place, Drawing] = {}
+    if not blocks:
+        return drawn
+    n, kept = BLOCK_CELLS, blocks.values()
+    layers = (np.stack([block.layers[name] for block in kept]).astype(np.float64) for name in LAYERS[:-1])
+    planes = np.stack([PLANES[name].quantised(layer) for name, layer in zip(LAYERS, layers, strict=False)])
+    for i, (block, own) in enumerate(blocks.items()):
+        place = _tile_of(block)
+        drawing = drawn[place] = drawings.setdefault(place, Drawing())
+        column, row = (n * (at % SQUARE) for at in block)
+        inside = slice(row, row + n), slice(column, column + n)
+        drawing.planes[:-1, *inside] = planes[:, i].reshape(-1, n, n)
+        drawing.newest_ns[inside] = own.layers["newest_ns"].reshape(n, n)
+    return drawn
 
 
 def _is_newer(tile: MapTile, since: MapVersion | None) -> bool:
@@ -160,10 +192,10 @@ def _place(tile: MapTile) -> Place:
 
 def tiles_of(view: View, layers: BlockLayers) -> TilesAnswer:
     """All tiles of a view."""
-    look = layers.look_at(view)
+    look, version = layers.look_at(view), view.version
     tiles = tuple(
-        tile_of(place, blocks, view.version)
+        drawing.tile(place, version)
         for some in _few(sorted({_tile_of(block) for block in look.cell_states}))
-        for place, blocks in of_tiles(layers, look, some)
+        for place, drawing in sorted(draw({}, of_tiles(layers, look, some)).items())
     )
-    return TilesAnswer(view.version, view.stamp_ns, layers.cell_m, whole=True, tiles=tiles)
+    return TilesAnswer(version, view.stamp_ns, layers.cell_m, whole=True, tiles=tiles)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -38,9 +39,12 @@ class AnswerPool:
     get their turn.
     """
 
-    def __init__(self, name: str, threads: int, budget: int) -> None:
-        """budget: total size of waiting and running tasks."""
+    def __init__(self, name: str, threads: int, budget: int, spare: Callable[[], float] | None = None) -> None:
+        """budget: total size of waiting and running tasks. spare: done by one thread while none waits; returns the
+        seconds until it is due again.
+        """
         self._budget, self._size = budget, 0
+        self._spare, self._spare_s = spare, 0.0 if spare else math.inf  # when it is due; infinite while it is done
         self._waiting: dict[int, Work] = {}  # by number, oldest first
         self._numbers = itertools.count()
         self._mean_s = 0.0  # duration of an answer
@@ -64,6 +68,12 @@ class AnswerPool:
             self._waiting[next(self._numbers)] = size, work
             self._news.notify()
 
+    def prompt(self) -> None:
+        """Have the spare work done soon."""
+        with self._news:
+            self._spare_s = 0.0
+            self._news.notify()
+
     def close(self) -> None:
         """Drop waiting tasks, and let running ones end."""
         with self._news:
@@ -84,15 +94,29 @@ class AnswerPool:
             del taken, work  # frees the query with it
             with self._news:
                 self._size -= size
-                self._mean_s += 0.1 * (time.monotonic() - began_s - self._mean_s)
+                if size:
+                    self._mean_s += 0.1 * (time.monotonic() - began_s - self._mean_s)
 
     def _take(self, order: Order) -> Work | None:
         with self._news:
             while not (self._waiting or self._closed):
-                self._news.wait()
+                left_s = self._spare_s - time.monotonic()
+                if left_s <= 0.0:
+                    self._spare_s = math.inf
+                    return 0, self._do_spare
+                self._news.wait(left_s if left_s < math.inf else None)
             if self._closed:
                 return None
             return self._waiting.pop(order(self._waiting))
+
+    def _do_spare(self) -> None:
+        wait_s = MAX_RETRY_S  # after a bug
+        try:
+            wait_s = self._spare() if self._spare else math.inf
+        finally:
+            with self._news:
+                self._spare_s = min(self._spare_s, time.monotonic() + wait_s)
+                self._news.notify()
 
 
 def _smallest(waiting: Mapping[int, Work]) -> int:
@@ -154,11 +178,14 @@ class MapQueryable:
 
     def __init__(self, session: zenoh.Session, key: str, source: MapSource, answers: Answers) -> None:
         self._source, self._answers, self._replies = source, answers, Replies(source)
-        self._now = AnswerPool("query", source.config.query_threads, ANSWER_BYTES)
-        # separate, so that folds of the past do not delay present answers
-        self._past = AnswerPool("past", 1, MOST_PAST)
-        # large ones, one at a time, to save memory
-        self._large = AnswerPool("large", 1, ANSWER_BYTES)
+
+    def __init__(self, name: str, threads: int, budget: int, spare: Callable[[], float] | None = None) -> None:
+        """budget: total size of waiting and running tasks. spare: done by one thread while none waits; returns the
+        seconds until it is due again.
+        """
+        self._budget, self._size = budget, 0
+        self._spare, self._spare_s = spare, 0.0 if spare else math.inf  # when it is due; infinite while it is done
+        self._waiting: dict[int, Work] = {}  # by number, oldest first
         self._queryable = session.declare_queryable(key, self._on_query)
 
     def stop(self) -> None:
@@ -188,8 +215,13 @@ class MapQueryable:
             else:
                 self._replies.submit(pool, size, asked, lambda: self._answers.answer(query))
 
-        try:
-            self._source.waits.add(query.after, query.wait_s, enter)
+        try:  # whoever merges the row has no time to answer
+            if self._source.waits.add(
+                query.after, query.wait_s, lambda error: self._now.submit(0, lambda: enter(error))
+            ):
+                self._now.prompt()
+            else:
+                enter(None)
         except QueryError as error:
             self._replies.refuse(asked, error)
 

@@ -51,7 +51,6 @@ COSTLY = 20  # least age relative to the last making, so that large maps cost no
 SPARE = 3  # lead before roads are too old, in durations of the last making
 ASKED_S = 600.0  # time after the last question during which roads are made
 PATIENCE_S = 2.0  # longest wait of a picture for the first roads
-END_S = 1.0  # longest wait for a running making on shutdown
 LOOK_BACK_NS = 30 * 24 * HOUR_NS  # traffic before the site's now; older rows are not read
 
 
@@ -158,30 +157,17 @@ class RoadMaps:
         self._newest: _Newest | None = None
         self.made, self.made_s = 0, 0.0
         self._asked_s = -math.inf  # never
-        self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
         self._begin("", NO_FACTS)
 
     def _begin(self, store: str, facts: Facts) -> None:
         """Restart following the journal."""
         self._traffic, self._followed, self._with = Traffic(), 0, (store, facts)
 
-    def start(self) -> None:
-        """Make roads in the background; without this, queries make them.
-
-        An existing map gets roads at once: the first query would wait for its whole journal.
-        """
+    def begin(self) -> None:
+        """Have the first `renew` make roads of an existing map: the first query would wait for its whole journal."""
         with suppress(QueryError):  # a follower without a map yet
             if self._source.run(lambda state: state.version.row):
                 self._ask()
-        self._thread = threading.Thread(target=self._run, name="roads", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Make no more roads."""
-        self._ended.set()
-        if self._thread:
-            self._thread.join(END_S)
 
     def read(self, as_of_ns: int | None = None, machine: str = "") -> RoadMap:
         """Roads as of a time, or recent ones; machine: only its traffic. Raises QueryError."""
@@ -213,25 +199,18 @@ class RoadMaps:
             log.warning("no road map reason=%s problem=%r", error.reason, str(error))
         return self._newest.roads.ages if self._newest else {}
 
-    def renew(self) -> None:
-        """Make present roads, unless there were no questions for long."""
-        if self._clock() - self._asked_s < ASKED_S:
-            with _journal_read(), self._lock:
-                self._now()
-
-    def _run(self) -> None:
-        wait_s = 0.0
-        while not self._ended.wait(wait_s):
-            began_s = self._clock()
-            try:
-                self.renew()
-            except QueryError as error:  # queries get the same answer
-                log.info("no road map reason=%s problem=%r", error.reason, str(error))
-            except Exception:  # a bug must not end the thread
-                log.exception("no road map")
-            took_s = self._clock() - began_s
-            # rarely, because all layers near new samples are derived again; at most half of the time
-            wait_s = max(max(FRESH_S, COSTLY * took_s) - SPARE * took_s, took_s)
+    def renew(self) -> float:
+        """Make present roads, unless there were no questions for long; returns seconds until the next time."""
+        began_s = self._clock()
+        try:
+            if began_s - self._asked_s < ASKED_S:
+                with _journal_read(), self._lock:
+                    self._now()
+        except QueryError as error:  # queries get the same answer
+            log.info("no road map reason=%s problem=%r", error.reason, str(error))
+        took_s = self._clock() - began_s
+        # rarely, because all layers near new samples are derived again; at most half of the time
+        return max(max(FRESH_S, COSTLY * took_s) - SPARE * took_s, took_s)
 
     def _lately(self) -> RoadMap:
         """The newest roads, if fresh, or those being made."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,7 @@ def segments(read: Read, query: SegmentsQuery) -> answers.Segments:
     if len(chosen) > MOST_SEGMENTS:
         problem = f"{len(chosen)} segments; at most {MOST_SEGMENTS} are answered: ask for less with `bounds`"
         raise QueryError(Refusal.TOO_LARGE, problem)
-    return answers.Segments(*_version(roads), hours, traffic.placed, tuple(map(rows, sorted(chosen))))
+    return answers.Segments(*_version(roads), hours, traffic.placed, tuple(rows.of(sorted(chosen))))
 
 
 def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
@@ -54,8 +54,8 @@ def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
         hours,
         query.target,
         float(lost.work_j[sorted(inside)].sum() / max(hours, 1e-9) / JOULE_PER_KWH),
-        tuple(rows.row(i, rank) for i, rank in ranks[: query.limit]),
-        tuple(map(rows.change, changes[:MOST_CHANGES])),
+        tuple(rows.of(ranks[: query.limit])),
+        tuple(rows.of_changes(changes[:MOST_CHANGES])),
     )
 
 
@@ -117,39 +117,40 @@ class _Records:
         machines = traffic.totals()["machines"]
         self._machines: Ints = np.bitwise_count(machines[:, 0] | machines[:, 1]).astype(np.int64)
 
-    def __call__(self, i: int) -> answers.RoadSegment:
-        lost, passes = self.lost, self.lost.passes[i] / self.hours
-        return answers.RoadSegment(
-            id=self._segments.ids[i],
-            line=self.line(i),
-            length_m=float(self._segments.length_m[i]),
-            resistance=_known(lost.c_rr[i]),
-            resistance_std=_known(lost.c_std[i]),
-            grade=_known(lost.grade[i]),
-            trend=_known(self._trends[i]),
-            unmeasured=float(lost.unmeasured[i]),
-            passes_ph=tuple(passes.tolist()),
-            tonnes_ph=tuple((passes * lost.kg[i] / 1000).tolist()),
-            guessed=bool(lost.guessed[i]),
-            machines=int(self._machines[i]),
-            fuel=self.fuel(i),
+    def of(self, chosen: Sequence[int]) -> list[answers.RoadSegment]:
+        """Records of these segments, made column by column."""
+        at, lost = np.array(chosen, np.int64), self.lost
+        passes = lost.passes[at] / self.hours
+        columns: tuple[Iterable[Any], ...] = (
+            [self._segments.ids[i] for i in chosen],
+            self.lines(chosen),
+            self._segments.length_m[at].tolist(),
+            *(_known(values[at]) for values in (lost.c_rr, lost.c_std, lost.grade, self._trends)),
+            lost.unmeasured[at].tolist(),
+            map(tuple, passes.tolist()),
+            map(tuple, (passes * lost.kg[at] / 1000).tolist()),
+            lost.guessed[at].tolist(),
+            self._machines[at].tolist(),
+            self.fuel(chosen),
         )
+        return list(map(answers.RoadSegment, *columns))
 
-    def fuel(self, i: int) -> answers.Fuel | None:
-        """Burned and predicted fuel of a segment."""
-        fuel = self._fuel
-        if fuel is None or not fuel.share[i]:
-            return None
-        burned = fuel.burned[i] + np.array([0.0, -NINETY, NINETY]) * fuel.burned_std[i]
-        predicted = np.array([fuel.predicted[i], fuel.low[i], fuel.high[i]])
-        burned_ph, predicted_ph = (tuple((litres / self.hours).tolist()) for litres in (burned, predicted))
-        return answers.Fuel(burned_ph, predicted_ph, float(fuel.share[i]))
+    def fuel(self, chosen: Sequence[int]) -> list[answers.Fuel | None]:
+        """Burned and predicted fuel of segments."""
+        fuel, at = self._fuel, np.array(chosen, np.int64)
+        if fuel is None:
+            return [None] * len(chosen)
+        burned = fuel.burned[at, None] + np.array([0.0, -NINETY, NINETY]) * fuel.burned_std[at, None]
+        predicted = np.stack([fuel.predicted[at], fuel.low[at], fuel.high[at]], axis=1)
+        litres_ph = (map(tuple, (litres / self.hours).tolist()) for litres in (burned, predicted))
+        some = list(map(answers.Fuel, *litres_ph, fuel.share[at].tolist()))
+        return [one if one.share else None for one in some]
 
-    def line(self, i: int) -> answers.Corners:
-        """Some points of a segment's line."""
-        line = self._segments.line(i)
-        some = np.concatenate([line[:-1:LINE_POINTS], line[-1:]]).round(2)
-        return tuple(tuple(point) for point in some.tolist())
+    def lines(self, chosen: Sequence[int]) -> list[answers.Corners]:
+        """Some points of each of these segments' lines."""
+        lines = list(map(self._segments.line, chosen))
+        some = (np.concatenate([line[:-1:LINE_POINTS], line[-1:]]).round(2).tolist() for line in lines)
+        return [tuple(map(tuple, points)) for points in some]
 
 
 class _Rows:
@@ -167,34 +168,39 @@ class _Rows:
         self._saved_kwh_ph, self._efficiency = saved_kwh_ph, efficiency
         self._last, self._since_ns = roads.last_changes, roads.since_ns()
         lost = records.lost
-        self._work = np.stack([lost.work_j, lost.low_j, lost.high_j]) / records.hours
+        self._work = np.stack([lost.work_j, lost.low_j, lost.high_j], axis=1) / records.hours
         self._kg = lost.kg.mean(axis=1)
 
-    def row(self, i: int, rank: int) -> answers.WorklistRow:
-        """A row of this rank."""
-        work, change = self._work[:, i], self._last.get(i)
-        kwh, of_diesel, of_driving = work / JOULE_PER_KWH, litres(work, self._efficiency), seconds(work, self._kg[i])
-        days = slice(*np.searchsorted(self._days.segment, [i, i + 1]).tolist())
-        return answers.WorklistRow(
-            rank,
-            self._records(i),
-            tuple(kwh.tolist()),
-            tuple(of_diesel.tolist()),
-            tuple(of_driving.tolist()),
-            since_ns=int(self._since_ns[i]),
-            before=change.before if change else None,
-            saved_kwh_ph=self._saved_kwh_ph[change] if change else None,
-            day_ns=tuple((self._days.day[days] * DAY_NS).tolist()),
-            day_resistance=tuple(self._days.c_rr[days].tolist()),
+    def of(self, ranks: Sequence[tuple[int, int]]) -> list[answers.WorklistRow]:
+        """Rows of these segments and ranks, made column by column."""
+        chosen, at = [i for i, _ in ranks], np.array([i for i, _ in ranks], np.int64)
+        work, changes = self._work[at], [self._last.get(i) for i in chosen]
+        a_row = work / JOULE_PER_KWH, litres(work, self._efficiency), seconds(work, self._kg[at, None])
+        days = list(map(slice, *(np.searchsorted(self._days.segment, side).tolist() for side in (at, at + 1))))
+        columns: tuple[Iterable[Any], ...] = (
+            [rank for _, rank in ranks],
+            self._records.of(chosen),
+            *(map(tuple, values.tolist()) for values in a_row),
+            self._since_ns[at].tolist(),
+            [change.before if change else None for change in changes],
+            [self._saved_kwh_ph[change] if change else None for change in changes],
+            [tuple((self._days.day[some] * DAY_NS).tolist()) for some in days],
+            [tuple(self._days.c_rr[some].tolist()) for some in days],
         )
+        return list(map(answers.WorklistRow, *columns))
 
-    def change(self, change: Repair) -> answers.RoadChange:
-        """A change of the ground."""
-        times, levels = (change.first_ns, change.seen_ns), (change.before, change.after)
-        line = self._records.line(change.segment)
-        saved, fuel = self._saved_kwh_ph[change], self._records.fuel(change.segment)
-        return answers.RoadChange(self._ids[change.segment], line, *times, *levels, saved, fuel)
+    def of_changes(self, changes: Sequence[Repair]) -> list[answers.RoadChange]:
+        """Changes of the ground."""
+        chosen = [change.segment for change in changes]
+        columns: tuple[Iterable[Any], ...] = (
+            [self._ids[i] for i in chosen],
+            self._records.lines(chosen),
+            *([getattr(change, name) for change in changes] for name in ("first_ns", "seen_ns", "before", "after")),
+            [self._saved_kwh_ph[change] for change in changes],
+            self._records.fuel(chosen),
+        )
+        return list(map(answers.RoadChange, *columns))
 
 
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else float(value)
+def _known(values: Floats) -> list[float | None]:
+    return [None if math.isnan(value) else value for value in values.tolist()]

@@ -216,7 +216,7 @@ def _in_window(squares: Squares, name: str, window: CellWindow) -> Floats32:
     """A layer of squares in a window (rows, columns)."""
     out: Floats32 = np.full((window.rows, window.columns), np.nan, np.float32)
     for place, values in zip(squares.by_place(), squares.layers[name], strict=True):
-        place_square(out, window, place, values)
+        place_square({name: out}, window, place, {name: values})
     return out
 
 

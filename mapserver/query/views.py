@@ -162,9 +162,9 @@ def read_cells(
     out: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in names}
     for some in chunks([block for block in view.pages if _touches(block, window)]):
         sums = evidence([view.pages[block] for block in some], [first[block] for block in some])
-        for name, values in cell_layers.read(sums, names, config.read, view.stamp_ns).items():
-            for block, of_block in zip(some, values, strict=True):
-                place(out[name], window, block, of_block)
+        layers = cell_layers.read(sums, names, config.read, view.stamp_ns)
+        for i, block in enumerate(some):
+            place(out, window, block, {name: values[i] for name, values in layers.items()})
     return out
 
 
@@ -179,14 +179,18 @@ def read_lanes(
     return LanesAnswer(view.version, view.stamp_ns, cell_m, known)
 
 
-def place(out: Floats32, window: CellWindow, block: Block, values: AnyArray) -> None:
-    """Copy values of a square of blocks, whose first one this is, into a window; (256,) of one block alone."""
-    n = math.isqrt(values.size)
+def place(out: Mapping[str, Floats32], window: CellWindow, block: Block, layers: Mapping[str, AnyArray]) -> None:
+    """Copy layers of a square of blocks, whose first one this is, into those of a window; (256,) of one block alone."""
+    if not layers:
+        return
+    n = math.isqrt(next(iter(layers.values())).size)
     column, row = block[0] * BLOCK_CELLS - window.column, block[1] * BLOCK_CELLS - window.row
     left, top = max(0, -column), max(0, -row)
     right, bottom = min(n, window.columns - column), min(n, window.rows - row)
     if left < right and top < bottom:
-        out[row + top : row + bottom, column + left : column + right] = values.reshape(n, n)[top:bottom, left:right]
+        for name, values in layers.items():
+            part = values.reshape(n, n)[top:bottom, left:right]
+            out[name][row + top : row + bottom, column + left : column + right] = part
 
 
 def widened(window: CellWindow, cells: int) -> CellWindow:

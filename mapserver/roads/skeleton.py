@@ -8,7 +8,7 @@ areas stay thick.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -17,7 +17,8 @@ import numba
 import numpy as np
 
 from mapserver.evidence.cells import CELLS, HEADING
-from mapserver.evidence.timeline import Block, TimedPages
+from mapserver.evidence.grid import READ_BLOCKS
+from mapserver.evidence.timeline import Block, TimedPages, plane_counts
 from mapserver.roads.ridges import AXES, Blur, ridges
 from protocol.arrays import AnyArray, Bools, Ints
 from protocol.site.geometry import BLOCK_CELLS
@@ -131,6 +132,7 @@ class Skeletons:
         """Centre lines of a whole map."""
         known, self._pages = self._pages, dict(pages)
         changed = [block for block, own in pages.items() if known.get(block) is not own]
+        axis_metres([pages[block] for block in changed])  # of all at once
         changed += [block for block in known if block not in pages]
         stale = self._near(changed)
         others = [tile for tile in stale if self._look(tile)]
@@ -210,23 +212,24 @@ class Skeletons:
             for at in (column, row)
         )
         blocks = [block for block in product(*spans) if block in self._pages]
-        parts = [axis_metres(self._pages[block]) for block in blocks]
+        parts = axis_metres([self._pages[block] for block in blocks])
         nothing = np.zeros(0, np.int64)
         codes, metres = (np.concatenate([nothing, *part]) for part in (zip(*parts, strict=True) if parts else ((), ())))
         ends = np.cumsum([len(part[0]) for part in parts], dtype=np.int64)
         return codes, metres, ends, np.array(blocks, np.int64).reshape(-1, 2) * BLOCK_CELLS, self._join, row, column
 
 
-def axis_metres(pages: TimedPages) -> tuple[AnyArray, AnyArray]:
-    """Driven cells of a block: cell * AXES + axis (n,), and metres (n,) in 1/4096 m."""
-    if axis_metres in pages.derived:
-        known: tuple[AnyArray, AnyArray] = pages.derived[axis_metres]
-        return known
-    codes, metres = _driven(pages.plane_counts(HEADING))
-    small = np.uint32 if metres.max(initial=0) < 2**32 else np.int64
-    driven = codes.astype(np.uint16), metres.astype(small)
-    pages.derived[axis_metres] = driven  # few cells of a block are driven
-    return driven
+def axis_metres(pages: Sequence[TimedPages]) -> list[tuple[AnyArray, AnyArray]]:
+    """Driven cells of blocks: cell * AXES + axis (n,), and metres (n,) in 1/4096 m."""
+    lacking = [one for one in pages if axis_metres not in one.derived]
+    for first in range(0, len(lacking), READ_BLOCKS):
+        some = lacking[first : first + READ_BLOCKS]
+        for one, sectors in zip(some, plane_counts(some, HEADING), strict=True):
+            codes, metres = _driven(sectors)
+            small = np.uint32 if metres.max(initial=0) < 2**32 else np.int64
+            # few cells of a block are driven
+            one.derived[axis_metres] = codes.astype(np.uint16), metres.astype(small)
+    return [one.derived[axis_metres] for one in pages]
 
 
 @numba.njit(cache=True, nogil=True)

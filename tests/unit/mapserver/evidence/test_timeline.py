@@ -7,7 +7,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.pages import CELL, Page, Pages, Record, is_sound
 from mapserver.evidence.settling import DAY_S, HOUR_S, Space, Tiers
-from mapserver.evidence.timeline import NO_PAGES, TimedPages, Timeline, evidence, settle_all, timed
+from mapserver.evidence.timeline import NO_PAGES, TimedPages, Timeline, evidence, plane_counts, settle_all, timed
 
 S = 10**9
 BUCKET_S = 300
@@ -144,8 +144,9 @@ def test_planes_are_summed_as_all_pages_are(weight):
         np.add.at(whole.reshape(-1), one.page.votes["place"], one.page.votes["count"].astype(np.int64))
     assert whole.any(axis=1).sum() == 40
     for part in (ev.HEADING, slice(0, 1), slice(0, ev.COUNTS)):
-        np.testing.assert_array_equal(pages.plane_counts(part), whole[part])
-    assert not NO_PAGES.plane_counts(ev.HEADING).any()
+        counts, nothing = plane_counts([pages, NO_PAGES], part)
+        np.testing.assert_array_equal(counts, whole[part])
+        assert not nothing.any()
 
 
 PLACES = ev.COUNTS * ev.CELLS

@@ -1,3 +1,4 @@
+import math
 import threading
 import time
 from collections import Counter
@@ -345,7 +346,8 @@ def waits():
 
 def added(waits: MergeWaits, row: int, wait_s: float = PATIENCE_S) -> Future:
     called: Future[QueryError | None] = Future()
-    waits.add(row, wait_s, called.set_result)
+    if not waits.add(row, wait_s, called.set_result):
+        called.set_result(None)
     return called
 
 
@@ -357,6 +359,16 @@ def test_rows_call_back_as_they_are_merged_in_any_order(waits):
     assert not later.done()
     waits.advance(12)
     assert later.result(PATIENCE_S) is None
+
+
+def test_a_wait_that_is_over_is_told_so_and_when_the_next_one_is(waits):
+    assert waits.time_out() == math.inf
+    over, waiting = added(waits, 7, 0.0), added(waits, 7)
+    assert 0.0 < waits.time_out() <= PATIENCE_S
+    assert over.result(0).reason == Refusal.AFTER_TIMEOUT
+    waits.advance(7)
+    assert waiting.result(0) is None
+    assert waits.time_out() == math.inf
 
 
 def test_waits_are_bounded_and_room_comes_back(waits, monkeypatch):

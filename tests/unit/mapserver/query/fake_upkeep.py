@@ -57,7 +57,6 @@ def answered(answers: AnswersOf, name: str, parameters: dict[str, str]) -> bytes
     if parameters.get("as_of") is None and name in ("segments", "worklist", "route", "way"):
         parameters = {"after": str(newest), **parameters}
     query, waited = parse_query(name, parameters), Future()
-    answers.source.waits.add(query.after, query.wait_s, waited.set_result)
-    if error := waited.result(PATIENCE_S):
+    if answers.source.waits.add(query.after, query.wait_s, waited.set_result) and (error := waited.result(PATIENCE_S)):
         raise error
     return answers.answer(query)

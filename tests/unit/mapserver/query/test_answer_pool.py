@@ -84,3 +84,25 @@ def test_a_bug_in_an_answer_costs_neither_thread_nor_budget(caplog):
         held.let_go(1)
         wait_for(lambda: held.done == ["next"])
     assert "answer failed" in caplog.text
+
+
+def test_spare_work_is_done_when_it_is_due_or_asked_for_and_answers_come_first():
+    held, done = Held(), list[str]()
+
+    def spare() -> float:
+        done.append("spare")
+        if len(done) == 3:
+            raise ZeroDivisionError
+        return float("inf")
+
+    with closing(AnswerPool("test", 1, 1000, spare)) as pool:
+        wait_for(lambda: done == ["spare"])
+        pool.submit(1, held.work("one"))
+        held.begun()
+        pool.prompt()
+        pool.submit(1, lambda: done.append("answer"))
+        held.let_go(1)
+        wait_for(lambda: len(done) == 3)
+        assert done[1] == "answer"
+        pool.prompt()
+        wait_for(lambda: len(done) == 4)

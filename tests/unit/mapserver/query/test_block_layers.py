@@ -104,7 +104,11 @@ def test_a_point_that_is_kept_is_what_its_region_says_until_something_comes_in_b
         first = answered(answers, "point", asked)
         assert answered(answers, "point", asked) == first
         assert kept_cell((0, 0), names[:2]) == decode_point(first).values
-        assert kept_cell((0, 0), names) is None, "ages follow from the site's now"
+        assert kept_cell((0, 0), names) is None, "one of its layers is not kept"
+        aged = {**asked, "layers": "resistance,age_s"}
+        of_region = answered(answers, "point", aged)
+        assert kept_cell((0, 0), ("resistance", "age_s")) == decode_point(of_region).values
+        assert answered(answers, "point", aged) == of_region
         assert kept_cell((5000, 5000), names[:2]) is None
         more = samples(5, x_m=np.arange(5) + 17.5, y_m=0.5, distance_m=4.0, c_rr=0.2)
         more["stamp_ns"] += 10**12

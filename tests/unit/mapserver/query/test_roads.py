@@ -13,7 +13,7 @@ from mapserver.calibration.correction import Correction, SampleCorrections
 from mapserver.journal.facts import Facts
 from mapserver.journal.location import JournalLocation
 from mapserver.query import road_maps
-from mapserver.query.answering import ROADS_MADE, Answers
+from mapserver.query.answering import Answers
 from mapserver.query.block_layers import BlockLayers
 from mapserver.query.map_tiles import Tiles
 from mapserver.query.road_maps import ASKED_S, FRESH_S, RoadMaps
@@ -26,7 +26,7 @@ from protocol.queries.routing import decode_answer
 from protocol.site.geometry import Bounds
 from sitegrid.answer_text import fuel_text
 from tests.patience import PATIENCE_S
-from tests.unit.mapserver.data import incoming, open_writer, refused, send, wait_for
+from tests.unit.mapserver.data import incoming, open_writer, refused, send
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of, source_of
 from tests.unit.mapserver.roads.drives import START_NS, along, passes
 
@@ -411,23 +411,20 @@ def test_roads_are_made_beside_while_somebody_asks(repaired):
     assert (roads.made, roads.read().version.row, roads.made) == (3, 6, 3), "and now somebody does"
 
 
-def test_roads_of_a_map_that_is_there_at_the_start_are_made_at_once_and_none_after_the_end(repaired, tmp_path):
-    answers = answers_of(repaired[0])
-    answers.close()  # never begun
-    answers = answers_of(repaired[0])
-    answers.start()
-    wait_for(lambda: answers.info()["counters"].get(ROADS_MADE))
-    answers.close()
-    wait_for(lambda: "roads" not in {thread.name for thread in threading.enumerate()})
-    with closing(open_writer(tmp_path / "empty")) as opened, closing(RoadMaps(source_of(opened))) as empty:
-        empty.start()
+def test_roads_of_a_map_that_is_there_at_the_start_are_made_before_anybody_asks(repaired, tmp_path):
+    roads = RoadMaps(source_of(repaired[0]))
+    roads.begin()
+    roads.renew()
+    assert roads.made == 1
+    with closing(open_writer(tmp_path / "empty")) as opened:
+        empty = RoadMaps(source_of(opened))
+        empty.begin()
         empty.renew()
         assert empty.made == 0, "nobody has asked yet"
 
 
 def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
     opened, _ = repaired
-    monkeypatch.setattr(road_maps, "FRESH_S", 0.0)
     failures, reader = iter("12"), JournalLocation.reader
 
     def fails(location):
@@ -436,11 +433,13 @@ def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
         return reader(location)
 
     monkeypatch.setattr(JournalLocation, "reader", fails)
-    with closing(RoadMaps(source_of(opened))) as roads:
-        with pytest.raises(QueryError, match="the disk is gone"):
-            roads.read()
-        roads.start()
-        wait_for(lambda: roads.made)
+    roads = RoadMaps(source_of(opened))
+    with pytest.raises(QueryError, match="the disk is gone"):
+        roads.read()
+    assert roads.renew() > 0.0
+    assert not roads.made
+    roads.renew()
+    assert roads.made
 
 
 @pytest.mark.parametrize(
