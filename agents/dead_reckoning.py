@@ -151,7 +151,7 @@ class DeadReckoning:
     slip: wheel slip per traction (drive force over weight), taken off where the machine has a torque sensor. weighs:
     whether payload readings count. mass_kg: with payload; a caller that estimates it may set it. travel_m:
     of `base_link`, down in reverse; distance_m: up in reverse too. traction: the newest. wheels: as of their newest
-    reading, which came at wheels_ns; a wheel that does not count is as good as silent. ground: the newest speed over
+    reading, which came at wheels_ns; a wheel that does not count counts as silent. ground: the newest speed over
     ground.
     """
 

@@ -1,4 +1,4 @@
-"""Closed tours: the zero of an accelerometer by coming back to where one was."""
+"""Closed loops: the zero of an accelerometer by coming back to where one was."""
 
 from __future__ import annotations
 

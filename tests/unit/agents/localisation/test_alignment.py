@@ -43,7 +43,7 @@ def reckoned(x_m: float = 0.0) -> DeadReckonedPose:
         fixes(20.0, 0.9, n=3),  # too few
         fixes(2.0, 0.9),  # there and back, in one place
         fixes(20.0, 0.9, mode="relative"),  # nothing absolute
-        stating(fixes(20.0, 0.9), 30.0),  # too unsure
+        stating(fixes(20.0, 0.9), 30.0),  # too uncertain
         [*stating(fixes(20.0, 0.9), 30.0), *fixes(2.0, 0.9)],  # what is sure has no spread
     ],
 )
