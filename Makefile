@@ -4,11 +4,12 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 TESTS := $(BIN)/python -m pytest --quiet --numprocesses auto --dist worksteal
 SIZE_demo := 340 MB to load, 1.2 GB on disk
+SIZE_docs := 120 MB to load, 330 MB on disk
 SIZE_dev := 670 MB to load, 2.4 GB on disk
 
 # make quick: unit tests that are not slow, in about a minute. make test: the proof. make nightly, make weekly: what
 # takes longer (CONTRIBUTING.md).
-.PHONY: venv demo quick test nightly weekly check lint-page chaos fuzz soak bench bundle
+.PHONY: venv demo quick test nightly weekly check docs lint-page chaos fuzz soak bench bundle
 
 venv: $(VENV)/.dev
 
@@ -28,7 +29,7 @@ $(VENV)/.%: pyproject.toml constraints.txt
 	TMPDIR=$(abspath $(VENV))/tmp $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
 		--config-settings editable_mode=compat --editable '.[$*]'; \
 	status=$$?; kill $$! 2>/dev/null; rm -rf $(VENV)/tmp; echo; exit $$status
-	@touch $@ $(if $(filter dev,$*),$(VENV)/.demo)
+	@touch $@ $(if $(filter dev,$*),$(VENV)/.demo $(VENV)/.docs)
 
 quick: venv
 	$(TESTS) -m "not slow and not processes and not nightly" tests/unit
@@ -50,6 +51,10 @@ check: venv
 	$(BIN)/python -m pytest --quiet tests/house
 	@if command -v npm >/dev/null; then $(MAKE) --no-print-directory lint-page; \
 	else echo "no npm: the live page's JavaScript is not checked; install it, for example with apt-get install npm"; fi
+
+# The documents as pages, with a search and the API: build/docs/docs/index.html. A warning is an error.
+docs: $(VENV)/.docs
+	$(BIN)/sphinx-build --quiet --fail-on-warning -c docs . build/docs
 
 # The live page's JavaScript; npm installs what checks it, as the lock file says.
 lint-page: tests/page/node_modules/.package-lock.json

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 from protocol.errors import ConfigError
 
-PRIVATE = 0o600  # what a site's machines sent is nobody else's business on a shared host
+PRIVATE = 0o600  # what a site's machines sent is private on a shared host
 
 
 def load_toml(path: Path) -> dict[str, Any]:

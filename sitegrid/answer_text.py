@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from protocol.arrays import Floats32
 from protocol.queries.answers import (
@@ -25,6 +26,7 @@ from protocol.queries.answers import (
 )
 from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
 from protocol.queries.places import where_it_lies
+from protocol.queries.reasons import CellReasons
 from protocol.queries.request import Compared
 from protocol.queries.requests import (
     AliveQuery,
@@ -36,11 +38,14 @@ from protocol.queries.requests import (
     PointQuery,
     PointsQuery,
     RegionQuery,
+    WhyQuery,
 )
 from protocol.queries.roads import Fuel, RoadSegment, Segments, SegmentsQuery, Worklist, WorklistQuery
 from protocol.queries.route_requests import LineQuery, RouteQuery
 from protocol.queries.routing import RouteAnswer
+from protocol.site.ground_classes import BOUNDARIES, ZONES
 from sitegrid.client import Client
+from sitegrid.notebook import unit_of
 from sitegrid.process.lifetime import plain
 from sitegrid.times import utc_text
 from sitegrid.trust_sentences import calibrated, why
@@ -54,49 +59,108 @@ def record_text(_: Client, __: Any, answer: Any) -> Answer:
     lines = []
     for name, value in table.items():
         parts = value.items() if isinstance(value, dict) else ()
-        lines += [f"{name}{'' if parts else f'  {value}'}", *(f"  {key}  {part}" for key, part in parts)]
+        lines.append(name if parts else f"{name}  {_words(value)}")
+        lines += [f"  {key}  {_words(part)}" for key, part in parts]
     return table, lines
+
+
+def _words(value: Any) -> str:
+    """A value of JSON as people write it."""
+    if value is None or isinstance(value, bool):
+        return {None: "-", True: "yes", False: "no"}[value]
+    if isinstance(value, float):
+        return _value(value)
+    return " ".join(map(_words, value)) if isinstance(value, list) else str(value)
 
 
 def _point(client: Client, query: PointQuery, point: PointAnswer) -> Answer:
     table = {"x_m": point.x_m, "y_m": point.y_m, **point.values, **_version(point)}
-    head = f"cell at {point.x_m:g}, {point.y_m:g} m{_as_of(query, point.stamp_ns)}"
-    lines = [head, *(f"  {name:18} {_value(value)}" for name, value in point.values.items())]
-    return table, lines + (
-        [] if np.isfinite([*point.values.values()]).any() else _off_map(client, point.x_m, point.y_m)
-    )
+    head = f"cell at {point.x_m:.12g}, {point.y_m:.12g} m{_as_of(query, point.stamp_ns)}"
+    if not np.isfinite([*point.values.values()]).any():
+        return table, [head, _nobody_was_there(client, point.x_m, point.y_m)]
+    kinds = {} if query.minus_ns else _names_of_classes(client)
+    return table, [head, *(f"  {name:22} {_worded(name, value, kinds)}" for name, value in point.values.items())]
 
 
-def _off_map(client: Client, x_m: float, y_m: float) -> list[str]:
-    """The map's extent, if the place is outside it."""
+def _nobody_was_there(client: Client, x_m: ArrayLike, y_m: ArrayLike) -> str:
+    """What to say where all of an answer is unknown; where the map lies, if none of the places (n,) is on it."""
     info = client.info()
-    west, south, east, north = (edge * info.site.cell_m for edge in info.bounds or (0, 0, 0, 0))
-    is_inside = west <= x_m < east and south <= y_m < north
-    if is_inside or not info.bounds:
-        return []
-    return [f"nobody was there: {where_it_lies(info.bounds, info.site.cell_m)}"]
+    if not info.bounds:
+        return "nothing is driven yet"
+    west, south, east, north = (edge * info.site.cell_m for edge in info.bounds)
+    x, y = np.asarray(x_m), np.asarray(y_m)
+    if ((west <= x) & (x < east)).any() and ((south <= y) & (y < north)).any():
+        return "nobody was there"
+    return f"nobody was there: {where_it_lies(info.bounds, info.site.cell_m)}"
 
 
-def _points(_: Client, __: PointsQuery, answer: PointsAnswer) -> Answer:
+def _names_of_classes(client: Client) -> dict[str, Sequence[str]]:
+    """Names of classes by layer; of resistance, unless the site has other boundaries."""
+    grounds = tuple(zone.name for zone in ZONES) if client.info().boundaries == BOUNDARIES else ()
+    return {"resistance_class": grounds, "resistance_class_filled": grounds, "slope_class": ("flat", "slope")}
+
+
+def _worded(name: str, value: float, kinds: dict[str, Sequence[str]]) -> str:
+    """A value of a layer with its unit, a class with its name."""
+    if math.isnan(value):
+        return _value(value)
+    if names := kinds.get(name):
+        return f"{value:g}, {names[int(value)]}"
+    return f"{_value(value)} {unit_of(name)}".removesuffix(" 1")
+
+
+def _why(client: Client, _: WhyQuery, reasons: CellReasons) -> Answer:
+    """What is known of a cell: where from, its values, and its votes by kind of ground."""
+    place = f"cell at {reasons.x_m:.12g}, {reasons.y_m:.12g} m"
+    if not reasons.metres:
+        return reasons, [place, _nobody_was_there(client, reasons.x_m, reasons.y_m)]
+    by = f"{reasons.metres:.3g} m driven by {', '.join(reasons.machines)}, last at {utc_text(reasons.newest_ns)}"
+    changed = f"changed at {utc_text(reasons.changed_ns)}" if reasons.changed_ns else "no change of the ground"
+    kinds = _names_of_classes(client)
+    rows = [
+        [name, _worded(name, _nan(value), kinds), _worded(name, _nan(reasons.before.get(name)), kinds)]
+        for name, value in reasons.values.items()
+    ]
+    values = _table(["", "now", "before the change"], rows if reasons.changed_ns else [[*row[:2], ""] for row in rows])
+    votes = zip(reasons.resistance.centres, reasons.resistance.votes, reasons.resistance.before, strict=True)
+    held = [[f"{at:.4f}", f"{now:.3g}", f"{old:.3g}"] for at, now, old in votes if now or old]
+    return reasons, [f"{place}: {by}; {changed}", *values, *_table(["votes: c_rr", "m", "m before"], held)]
+
+
+def _nan(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _points(client: Client, __: PointsQuery, answer: PointsAnswer) -> Answer:
     places = {"x_m": answer.x_m.tolist(), "y_m": answer.y_m.tolist()}
     table = {**places, **{name: values.tolist() for name, values in answer.layers.items()}, **_version(answer)}
     rows = (
         [f"{x:g}", f"{y:g}", *(_value(float(values[i])) for values in answer.layers.values())]
         for i, (x, y) in enumerate(zip(answer.x_m, answer.y_m, strict=True))
     )
-    return table, _table(["x", "y", *answer.layers], rows)
+    lines = _table(["x", "y", *answer.layers], rows)
+    return table, lines if _is_known(answer.layers) else [*lines, _nobody_was_there(client, answer.x_m, answer.y_m)]
 
 
-def _region(_: Client, query: RegionQuery, region: Region) -> Answer:
+def _is_known(layers: Mapping[str, Any]) -> bool:
+    return any(np.isfinite(values).any() for values in layers.values())
+
+
+def _region(client: Client, query: RegionQuery, region: Region) -> Answer:
     summary = {name: _statistics(values) for name, values in region.layers.items()}
     size = {"columns": len(region.x_m), "rows": len(region.y_m)}
     b = region.bounds
     place = f"{b.west_m:g}..{b.east_m:g} x {b.south_m:g}..{b.north_m:g} m, {region.cell_m:g} m cells"
     lines = [f"{place}{_as_of(query, region.stamp_ns)}, journal row {region.merged}"]
-    for name, row in summary.items():
-        span = f"min {row['min']:.4g}   mean {row['mean']:.4g}   max {row['max']:.4g}"
-        lines.append(f"  {name:18} {row['known']:7d} known   {span}")
-    return {**size, **_version(region), "layers": summary}, lines
+    table = {**size, **_version(region), "layers": summary}
+    if not _is_known(region.layers):
+        return table, [*lines, _nobody_was_there(client, region.x_m, region.y_m)]
+    head = ["layer", "known cells", "least", "mean", "most", "unit"]
+    rows = (
+        [name, str(row["known"]), *(_value(row[part]) for part in ("min", "mean", "max")), unit_of(name)]
+        for name, row in summary.items()
+    )
+    return table, [*lines, *_table(head, rows)]
 
 
 def _version(answer: PointAnswer | PointsAnswer | Region | RouteAnswer) -> dict[str, Any]:
@@ -104,10 +168,10 @@ def _version(answer: PointAnswer | PointsAnswer | Region | RouteAnswer) -> dict[
     return {"store": version.store, "merged": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
 
 
-def _history(_: Client, __: HistoryQuery, answer: HistoryAnswer) -> Answer:
+def _history(client: Client, __: HistoryQuery, answer: HistoryAnswer) -> Answer:
     table = {"spans": [{"first_ns": s.first_ns, "last_ns": s.last_ns, **s.values} for s in answer.spans]}
     if not answer.spans:
-        return table, ["nobody was there"]
+        return table, [_nobody_was_there(client, answer.x_m, answer.y_m)]
     rows = ([utc_text(s.first_ns), *map(_value, s.values.values())] for s in answer.spans)
     return table, _table(["from (UTC)", *answer.spans[0].values], rows)
 
@@ -115,7 +179,7 @@ def _history(_: Client, __: HistoryQuery, answer: HistoryAnswer) -> Answer:
 def _segments(_: Client, __: SegmentsQuery, answer: Segments) -> Answer:
     if not answer.segments:
         return answer, ["no roads are known"]
-    head = ["stretch", "around", "m", "resistance", "+-", "grade", "passes/h there", "back", "t/h there", "back"]
+    head = ["section", "around", "m", "resistance", "+-", "grade", "passes/h there", "back", "t/h there", "back"]
     rows = (
         [
             *_place(one),
@@ -130,9 +194,10 @@ def _segments(_: Client, __: SegmentsQuery, answer: Segments) -> Answer:
 
 def _worklist(_: Client, __: WorklistQuery, answer: Worklist) -> Answer:
     total = f"{answer.total_kwh_ph:.2f} kWh/h lost on all roads against a resistance of {answer.target:g}"
+    total += f", calculated from {60 * answer.hours:.0f} minutes of traffic"
     if not answer.rows and not answer.changes:
-        return answer, [f"{total}: no stretch is worse for sure"]
-    head = ["", "stretch", "around", "kWh/h", "low..high", "l/h", "s/h", "resistance", "+-", "a day", "machines"]
+        return answer, [f"{total}: no section is worse beyond doubt"]
+    head = ["", "section", "around", "kWh/h", "low..high", "l/h", "s/h", "resistance", "+-", "a day", "machines"]
     head += ["since", "before"]
     rows = (
         [
@@ -143,17 +208,17 @@ def _worklist(_: Client, __: WorklistQuery, answer: Worklist) -> Answer:
             f"{row.litres_ph[0]:.2f}",
             f"{row.seconds_ph[0]:.0f}",
             *map(_value, (row.segment.resistance, row.segment.resistance_std)),
-            "-" if row.segment.trend is None else f"{row.segment.trend:+.4f}",
+            "-" if row.segment.trend is None else f"{row.segment.trend:+z.4f}",
             str(row.segment.machines),
             utc_text(row.since_ns),
             "-" if row.before is None else _value(row.before),
         ]
         for row in answer.rows
     )
-    lines = [f"{total}, traffic of {answer.hours:.2f} h", *_table(head, rows)]
+    lines = [total, *_table(head, rows)]
     lines += [f"{row.segment.id}: {fuel_text(row.segment.fuel)}" for row in answer.rows if row.segment.fuel]
     if any(row.segment.guessed for row in answer.rows):
-        lines.append("no machine stated its mass on some of them: what is lost there is a guess")
+        lines.append("no machine stated its mass on some of them: their losses are guesses")
     lines += [
         f"{utc_text(one.first_ns)} {one.id}: resistance {_value(one.before)} -> {_value(one.after)}, "
         f"saves {one.saved_kwh_ph:.2f} kWh/h{f'; {fuel_text(one.fuel)}' if one.fuel else ''}"
@@ -231,13 +296,14 @@ def change_line(change: GroundChange) -> str:
 
 
 def _info(_: Client, __: InfoQuery, info: MapInfo) -> Answer:
+    west, south, east, north = (edge * info.site.cell_m for edge in info.bounds or (0, 0, 0, 0))
     return info, [
-        f"site {info.site.name}: {info.cells} cells driven, bounds {info.bounds and list(info.bounds)}",
+        f"site {info.site.name}: {info.cells} cells driven, in {west:g}..{east:g} x {south:g}..{north:g} m",
         f"  journal row {info.journalled}, merged {info.merged}, snapshot {info.snapshot}",
         f"  {_checkpoints(info.checkpoints)}",
-        f"  samples merged {info.samples_merged}, too unsure of their place {info.samples_too_unsure}",
+        f"  samples merged {info.samples_merged}; rejected, position too uncertain: {info.samples_too_unsure}",
         *(
-            f"  {name}: {m.samples} samples, {m.lost} lost, {m.spools} spools"
+            f"  {name}: {m.samples} samples, {m.lost} lost, spool opened {m.spools} times"
             for name, m in sorted(info.machines.items())
         ),
         *(f"  {name}: {count}" for name, count in sorted(info.counters.items())),
@@ -256,7 +322,7 @@ def _drive(_: Client, query: LineQuery, answer: RouteAnswer) -> Answer:
     taken = f"{totals.time_s:.0f} s ({totals.time_low_s:.0f}..{totals.time_high_s:.0f})"
     ground = f"{totals.unknown:.0%} unknown, {totals.unmeasured:.0%} driven and not measured"
     lines = [
-        f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up, {ground}",
+        f"{totals.length_m:.0f} m, {totals.lift_m:+z.1f} m up, {ground}",
         f"{machine.mass_kg / 1000:.1f} t, at most {machine.speed_mps:g} m/s, {machine.power_w / 1000:.0f} kW",
         f"{kwh}, {totals.litres:.2f} l of diesel, {totals.braked_j / 3.6e6:.2f} kWh braked, {taken}",
         *corners,
@@ -268,7 +334,7 @@ def _drive(_: Client, query: LineQuery, answer: RouteAnswer) -> Answer:
             f"{steps.x_m[i]:.0f},{steps.y_m[i]:.0f}",
             f"{steps.resistance[i]:.4f}",
             f"{steps.resistance_std[i]:.4f}",
-            f"{100 * steps.slope[i]:+.1f}",
+            f"{100 * steps.slope[i]:+z.1f}",
             f"{steps.unknown[i]:.0%}",
             f"{steps.energy_j[i] / 3.6e6:.3f}",
             f"{steps.braked_j[i] / 3.6e6:.3f}",
@@ -300,7 +366,7 @@ def _as_of(query: Compared[Any], stamp_ns: int) -> str:
 
 
 def _value(value: float | None) -> str:
-    return "unknown" if value is None or math.isnan(value) else f"{value:.4g}"
+    return "unknown" if value is None or math.isnan(value) else f"{value:z.4g}"
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -318,6 +384,7 @@ def _statistics(values: Floats32) -> dict[str, float]:
 
 AS_TEXT: dict[str, Callable[..., Answer]] = {
     "point": _point,
+    "why": _why,
     "points": _points,
     "region": _region,
     "history": _history,

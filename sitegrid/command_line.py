@@ -10,11 +10,14 @@ import errno
 import json
 import logging
 import pkgutil
+import re
 import sys
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from types import ModuleType
+from typing import NoReturn
 
 import zenoh
 
@@ -40,6 +43,18 @@ ADVICE = {
     errno.EADDRINUSE: "end the process that listens there, or choose another port",
 }
 log = logging.getLogger("sitegrid.command_line")
+
+
+class CommandParser(ArgumentParser):
+    """A parser that names the words that a mistyped one may have meant, before the usage and all the choices."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit code 2."""
+        if mistyped := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message):
+            word, choices = mistyped.groups()
+            if meant := get_close_matches(word, re.findall(r"[\w-]+", choices), n=2):
+                self.exit(2, f"{self.prog}: '{word}' is not known; did you mean {' or '.join(meant)}?\n")
+        super().error(message)
 
 
 def run(words: Sequence[str], commands: ModuleType = commands, program: str = "sitegrid") -> int:
@@ -82,7 +97,7 @@ def build_parser(commands: ModuleType = commands, program: str = "sitegrid") -> 
     `--help` lists them by the package's `GROUPS`: heading to names.
     """
     about = (commands.__doc__ or "").partition("\n")[0]
-    parser = ArgumentParser(prog=program, description=about, formatter_class=RawDescriptionHelpFormatter)
+    parser = CommandParser(prog=program, description=about, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("--version", action="version", version=f"sitegrid {package_version()}")
     nouns = parser.add_subparsers(metavar="COMMAND", required=True, help="one of those below; COMMAND --help says more")
     those = pkgutil.walk_packages(commands.__path__, f"{commands.__name__}.")

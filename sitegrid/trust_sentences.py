@@ -55,12 +55,12 @@ def _sentence(reason: str, evidence: Mapping[str, Any]) -> str:
             case "offset":
                 return f"places {math.hypot(evidence['offset_east_m'], evidence['offset_north_m']):.1f} m off"
             case "clock":
-                return f"clock {evidence['clock_s']:+.0f} s off"
+                return f"clock {evidence['clock_s']:+z.0f} s off"
             case "disagrees":
                 return f"agrees with the others on {100 * evidence['agreement']:.0f} % of the ground"
             case "beyond_data_sheet":
                 off = f"torque reads {evidence['torque_gain']:.2f} times what it should"
-                return f"beyond its data sheet: {off}, accelerometer {evidence['zero']:.4f} off; a person may let it in"
+                return f"beyond its data sheet: {off}, accelerometer {evidence['zero']:.4f} off; a person may trust it"
     return reason
 
 

@@ -1,7 +1,7 @@
 """Drives and arms of the comparison: machines, links, and one deviating machine.
 
 Four tours of the paper's site, driven in turn by one machine or by up to eight at once. All share one stretch in one
-direction, so a lone machine drives them as one closed tour without detour; its extra time is what the others would
+direction, so a lone machine drives them as one closed loop without detour; its extra time is what the others would
 drive.
 """
 

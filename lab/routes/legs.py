@@ -93,7 +93,7 @@ def _spans(table: Table, track: LoadTrack) -> Iterator[tuple[int, int, tuple[boo
 
 
 def _laps(track: LoadTrack, begin: int, end: int) -> Iterator[tuple[int, int]]:
-    """Complete laps of a closed tour, starting at full speed."""
+    """Complete laps of a closed loop, starting at full speed."""
     first = int(np.searchsorted(track.driven_m, track.driven_m[begin] + LEAST_M))
     while first < end:
         on = np.arange(first, end)

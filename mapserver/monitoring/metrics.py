@@ -148,7 +148,7 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
         _gauge("sitegrid_checkpoint_newest_timestamp_seconds", "Until when the newest goes.", past["newest_ns"] / 1e9),
         _counter("sitegrid_checkpoints_passed_over_total", "Damaged ones; they are made again.", past["passed_over"]),
         _gauge("sitegrid_map_samples", "Samples that are in the map.", info["samples_merged"]),
-        _gauge("sitegrid_map_samples_too_unsure", "Samples whose place is too unsure.", info["samples_too_unsure"]),
+        _gauge("sitegrid_map_samples_too_unsure", "Samples of too uncertain a position.", info["samples_too_unsure"]),
         _gauge("sitegrid_map_cells", "Cells that are known.", info["cells"]),
         _gauge("sitegrid_map_newest_timestamp_seconds", "Newest stamp of trusted machines.", info["stamp_ns"] / 1e9),
         _gauge("sitegrid_map_ahead_seconds", "How far that is ahead of the server's clock.", _ahead_s(info)),

@@ -23,7 +23,17 @@ Box = tuple[int, int, int, int]  # left, top, right, bottom [px]
 MAX_SIDE_PX, MAX_AREA_PX, MAX_CELL_PX = 1240, 800_000, 64  # limits of the ground, without margins
 ARROW_SPACING_PX = 34
 UNKNOWN_COLOUR, WRONG_COLOUR = (228, 228, 228), (255, 0, 255)
-FLAT_COLOUR, SLOPE_COLOUR = ZONES[0].bgr, ZONES[1].bgr
+EASY, HARD = (119, 55, 36), (92, 221, 251)  # ends of the live page's scale: dark blue, yellow
+
+
+def _ordered(c_rr: float) -> Colour:
+    """The colour of a rolling resistance between EASY and HARD, in its logarithm, as on the live page."""
+    share = math.log(c_rr / ZONES[0].c_rr) / math.log(ZONES[-1].c_rr / ZONES[0].c_rr)
+    blue, green, red = (round(easy + share * (hard - easy)) for easy, hard in zip(EASY, HARD, strict=True))
+    return blue, green, red
+
+
+GROUND_COLOURS = tuple(_ordered(zone.c_rr) for zone in ZONES)
 # bright, unlike any ground; a dark edge separates them from pale ground
 TRACK_COLOURS: tuple[Colour, ...] = (
     (255, 255, 255), (255, 240, 0), (0, 150, 255), (255, 110, 255), (170, 255, 170), (255, 190, 150), (150, 190, 255),
@@ -65,11 +75,11 @@ class _Scale:
 def draw_resistance(
     region: Region, tracks: Sequence[DrawnTrack] = (), title: str = "Rolling resistance", notes: Sequence[str] = ()
 ) -> Image:
-    """Draw the layer `resistance` in the paper's classes. notes: lines below the legend.
+    """Draw the layer `resistance` in the paper's classes, dark where it is easy to roll. notes: lines below the legend.
 
     A layer `resistance_filled` is drawn pale in the gaps.
     """
-    entries = [LegendEntry(zone.bgr, f"{zone.name}  {zone.c_rr:g}") for zone in ZONES]
+    entries = [LegendEntry(GROUND_COLOURS[i], f"{zone.name}  {zone.c_rr:g}") for i, zone in enumerate(ZONES)]
     scale = _scale(region)
     ground = _paint(resistance_class(region["resistance"]), entries, scale)
     if "resistance_filled" in region.layers:
@@ -83,7 +93,7 @@ def draw_resistance(
 
 def draw_grade(region: Region, tracks: Sequence[DrawnTrack] = (), title: str = "Grade") -> Image:
     """Draw `grade_east`, `grade_north` as flat and slope, with uphill arrows."""
-    entries = [LegendEntry(FLAT_COLOUR, "flat"), LegendEntry(SLOPE_COLOUR, "slope > 7.5 deg")]
+    entries = [LegendEntry(EASY, "flat"), LegendEntry(HARD, "slope > 7.5 deg")]
     scale, classes = _scale(region), slope_class(region["grade_east"], region["grade_north"])
     ground = _paint(classes, entries, scale)
     _draw_arrows(ground, region, classes, scale)
@@ -95,7 +105,7 @@ def draw_difference(region: Region, truth: NamedLayers, kind: Literal["resistanc
     classes, true = _classes(region, kind), _classes(truth, kind)
     if classes.shape != true.shape:
         raise ValueError(f"truth has shape {true.shape}, the map {classes.shape}")
-    colours = [zone.bgr for zone in ZONES] if kind == "resistance" else [FLAT_COLOUR, SLOPE_COLOUR]
+    colours = GROUND_COLOURS if kind == "resistance" else (EASY, HARD)
     names = [zone.name for zone in ZONES] if kind == "resistance" else ["flat", "slope"]
     entries = [LegendEntry(_pale(colour), f"right: {name}") for colour, name in zip(colours, names, strict=True)]
     entries.append(LegendEntry(WRONG_COLOUR, "wrong class"))

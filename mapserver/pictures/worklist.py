@@ -55,7 +55,7 @@ def draw_worklist(roads: Segments, worklist: Worklist) -> Image:
     classes = [LegendEntry(WORST, f"costs most: the first {len(rows)}")] if rows else []
     classes += [LegendEntry(colour, words) for _, colour, words in STEPS] + [LegendEntry(UNKNOWN, "not known")]
     classes += [LegendEntry(REPAIRED, "repaired")] if repaired else []
-    title = f"Where work pays: {worklist.total_kwh_ph:.1f} kWh an hour lost against a resistance of {worklist.target:g}"
+    title = f"Worth grading: {worklist.total_kwh_ph:.1f} kWh an hour lost against a resistance of {worklist.target:g}"
     return compose(ground, axes, title, classes, notes=_notes(worklist))
 
 

@@ -198,5 +198,5 @@ class WorklistQuery(RoadQuery[Worklist]):
     limit: int = asked(count(1, MAX_LIMIT), "limit", f"stretches, 1 to {MAX_LIMIT}", 100)
 
     name = "worklist"
-    help = "stretches of road where work pays, the dearest first"
+    help = "road sections that are worth grading, most expensive first"
     codec = Codec(encode_worklist, decode_worklist)

@@ -39,7 +39,7 @@ MAX_LENGTH_M = 100_000.0
 MIN_STEP_M, MAX_STEP_M = 1.0, 10_000.0
 MAX_STEPS = 10_000
 ENERGY, TIME = "energy", "time"
-DEAREST, REFUSE = "dearest", "refuse"  # of unknown ground: as dear as the dearest tenth around, uphill; or not at all
+DEAREST, REFUSE = "dearest", "refuse"  # of unknown ground: the cost of the worst tenth nearby, uphill; or no passage
 
 # Parameters of a machine, its attributes, and what they are.
 _VALUES = {

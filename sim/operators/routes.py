@@ -1,4 +1,4 @@
-"""Routes: closed tours, or cycles of open legs with stops; speed limits in curves."""
+"""Routes: closed loops, or cycles of open legs with stops; speed limits in curves."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Route:
         return sum(leg.length_m for leg in self.legs)
 
     def reversed(self) -> Route:
-        """The closed tour in the opposite direction."""
+        """The closed loop in the opposite direction."""
         (tour,) = self.legs
         return Route((replace(tour, points=tour.points[::-1].copy()),))
 

@@ -70,7 +70,7 @@ def _check_fleet(scenario: Scenario, fleet: FleetConfig, routes: Mapping[str, Ro
         if name not in routes:
             raise ValueError(f"routes: there is no {name!r}; there are {', '.join(routes)}")
         if fleet.other_way and not routes[name].legs[0].closed:
-            raise ValueError(f"other_way: route {name!r} is no closed tour")
+            raise ValueError(f"other_way: route {name!r} is no closed loop")
         for leg in routes[name].legs:
             _check_curvature(leg, model, name)
             if leg.payload_kg is not None and not 0 <= leg.payload_kg <= model.payload_kg:

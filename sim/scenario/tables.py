@@ -40,7 +40,7 @@ class LegConfig:
 
 @dataclass(frozen=True)
 class RouteConfig:
-    """Route: `corners` of a closed tour, or a repeated chain of `leg`s."""
+    """Route: `corners` of a closed loop, or a repeated chain of `leg`s."""
 
     name: str
     corners: tuple[Point, ...] = ()

@@ -113,7 +113,9 @@ def _role(arguments: Namespace, known: RegisterEntry | None) -> str:
 def _revoke(arguments: Namespace, _: datetime) -> None:
     register = registers.load_register(arguments.dir).without(arguments.name)
     registers.save_register(arguments.dir, register)
-    line = f"{arguments.name} is let in no more once the router has this {REGISTER_FILE}; it takes that up by itself"
+    line = (
+        f"{arguments.name} may not join any more once the router has this {REGISTER_FILE}; it takes that up by itself"
+    )
     _tell(arguments, line, name=arguments.name, revoked=True)
 
 

@@ -23,7 +23,7 @@ def add_options(parser: ArgumentParser) -> None:
     sides = "west, south, east, north in metres (default: the whole map)"
     add("--bounds", type=float, nargs=4, metavar=("W", "S", "E", "N"), help=sides)
     add("--truth", type=Path, help="true map of a simulation (truth_map.npz): also draw the difference")
-    add("--worklist", action="store_true", help="draw roads, and the ten stretches where work pays most, instead")
+    add("--worklist", action="store_true", help="draw roads and the ten sections most worth grading instead")
     drawn = parser.add_mutually_exclusive_group()
     line = "draw a drive over these places, and what it costs along the way, instead"
     drawn.add_argument("--line", type=float, nargs="+", metavar="M", help=line)

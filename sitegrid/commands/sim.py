@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from protocol.errors import ConfigError
 from sitegrid.options.groups import add_network
 from sitegrid.options.values import FOLDER, PICTURE
-from sitegrid.process.lifetime import END_S, note, say, stop_flag
+from sitegrid.process.lifetime import END_S, note, say, stop_flag, tell
 from sitegrid.process.progress import Display
 from sitegrid.security.join import join
 
@@ -75,8 +75,8 @@ def run(arguments: Namespace) -> int:
     settings = join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name)
     if arguments.ports:
         settings = dataclasses.replace(settings, wait_s=-1)  # receivers speak before anybody connects to a router
-    tell = (lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None
-    report = publish(config, settings, stop, on_progress=tell, truth_dir=arguments.truth, ports_dir=arguments.ports)
+    progress = (lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None
+    report = publish(config, settings, stop, on_progress=progress, truth_dir=arguments.truth, ports_dir=arguments.ports)
     true = f"; the truth is in {arguments.truth}" if arguments.truth else ""
     line = f"simulated {report.simulated_s:g} s of {report.machines} machines: {report.readings} readings{true}"
     say({"ended": dataclasses.asdict(report)}) if arguments.json else note(line)
@@ -92,7 +92,9 @@ def _record(config: SimConfig, arguments: Namespace, stop: threading.Event) -> i
         show = partial(display.show, total_s=seconds, what="recording")
         simulator = record(config, arguments.record, arguments.truth, on_progress=show, stop=stop)
     table = {"recorded": str(arguments.record), "machines": len(simulator.machines), "seconds": simulator.simulated_s}
-    say(table | ({"truth": str(arguments.truth)} if arguments.truth else {}))
+    true = {"truth": str(arguments.truth)} if arguments.truth else {}
+    line = f"{len(simulator.machines)} machines drove {simulator.simulated_s:g} s, recorded in {arguments.record}"
+    say(table | true) if arguments.json else tell("; the truth is in ".join([line, *true.values()]))
     return 0
 
 

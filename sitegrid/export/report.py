@@ -1,4 +1,4 @@
-"""A shift lead's page: map, where work pays, savings of repairs, odd machines, data quality."""
+"""A shift lead's page: map, sections worth grading, savings of repairs, odd machines, data quality."""
 
 from __future__ import annotations
 

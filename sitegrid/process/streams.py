@@ -101,7 +101,7 @@ def lines(report: Report) -> list[str]:
             rows = [{k: row[k] for k in shown} for row in value]
             shown_lines.append(table(_turned(rows) if len(rows[0]) > MOST_COLUMNS else rows))
         elif value not in ([], {}):
-            shown_lines.append(f"{name}: {value}")
+            shown_lines.append(f"{name}: {', '.join(map(str, value)) if isinstance(value, list) else value}")
     return shown_lines
 
 

@@ -116,7 +116,7 @@ def write_private(path: Path, data: bytes) -> None:
 
 def register_toml(register: Register) -> str:
     """The register as TOML with a checksum: a flipped bit must admit nobody."""
-    lines = ["# Who is let in. Written by `sitegrid keys`."]
+    lines = ["# Who may join. Written by `sitegrid keys`."]
     lines += toml_lines({"site": register.site, "hosts": list(register.hosts)})
     for name, entry in sorted(register.names.items()):
         lines += ["", f"[names.{name}]", *toml_lines({"role": entry.role, "serial": entry.serial})]

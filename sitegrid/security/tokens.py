@@ -100,7 +100,7 @@ class TokenFile:
             try:
                 self._tokens = load_tokens(self._folder)
             except ConfigError as error:
-                log.error("nobody is let in: %s", error)
+                log.error("nobody may join: %s", error)
                 self._tokens = Tokens()
         return self._tokens.person(token, datetime.now(UTC))
 

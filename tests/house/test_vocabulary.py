@@ -1,6 +1,6 @@
 """One word per thing: replaced private words do not return (docs/glossary.md).
 
-Checks identifiers, options, configuration keys and headings, not sentences.
+Single words are looked for in identifiers, options, keys of configuration files and headings; phrases in all sentences.
 """
 
 from __future__ import annotations
@@ -38,6 +38,23 @@ REPLACED = {
 }
 WHOLE = dict.fromkeys(("found", "of"), "a noun that says what it is") | dict.fromkeys(("gives", "says"), "measures")
 PAIRS = {("left", "out"): "excluded", ("put", "aside"): "quarantine", ("way", "m"): "distance_m"}
+# Phrases, and what says it: for documents, docstrings, comments and messages.
+PHRASES = {
+    "zero error": "bias",
+    "closed tour": "closed loop",
+    "another course": "diverged",
+    "nobody else's business": "private",
+    "too unsure": "too uncertain",
+    "good as silent": "counts as silent",
+    "as dear as": "costs as much as",
+    "dearer ": "more expensive",
+    "work pays": "worth grading",
+    "is let in": "may join",
+    "let it in": "trust it",
+    "fade what": "fade uncertain, fade old",
+    "good ground rolls": "target rolling resistance",
+    "risen by nothing": "climbed nothing",
+}
 # Of the field or the language.
 COMPOUNDS = {
     tuple(compound.split()) for compound in (*("dead reckoning", "dead reckoned", "data sheet", "data sheets"),)
@@ -114,6 +131,18 @@ def test_no_heading_is_made_of_private_words() -> None:
         headings = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
         words = [word for heading in headings for word in re.findall(r"[\w-]+", heading.replace("dead reckoning", ""))]
         wrong += [f"{path.relative_to(ROOT)} {w}" for w in words if w not in WHOLE and replaced(w.replace("-", "_"))]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_sentence_has_a_phrase_that_a_plainer_one_replaced() -> None:
+    files = [path for path in tracked("*.py", "*.md", "*.toml", "*.js", "*.ipynb") if "results" not in path.parts]
+    wrong = [
+        f"{path.relative_to(ROOT)}:{number} {phrase}: {better}"
+        for path in files
+        for number, line in enumerate(path.read_text(encoding="utf-8").lower().splitlines(), 1)
+        for phrase, better in PHRASES.items()
+        if phrase in line
+    ]
     assert not wrong, "\n".join(wrong)
 
 

@@ -1,10 +1,13 @@
-"""The notebooks of examples/ and README's Python run on a site."""
+"""Notebooks of examples/, Python and commands of the documents run on a site; the documents build."""
 
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
+from pathlib import Path
+from textwrap import dedent
 
 import pytest
 
@@ -13,6 +16,7 @@ from tests.paths import ROOT
 
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
+ENDPOINT = "tcp/127.0.0.1:7447"
 
 
 @pytest.mark.nightly
@@ -33,10 +37,41 @@ def test_a_notebook_runs_and_was_saved_with_its_answers(hauling: WebSite, name: 
 
 
 @pytest.mark.processes
-def test_the_python_of_the_readme_runs(hauling: WebSite):
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
-    assert code.count('connect("tcp/127.0.0.1:7447", "paper")') == 1
-    here = code.replace("tcp/127.0.0.1:7447", hauling.endpoint).replace('"paper"', repr(NAME))
+@pytest.mark.parametrize("page", ["README.md", "docs/tutorials/ask-from-python.md"])
+def test_the_python_of_a_page_runs_and_prints_what_stands_below_it(hauling: WebSite, page: str):
+    ((code, below),) = re.findall(r"```python\n(.*?)```\n((?: {4}.*\n)*)", (ROOT / page).read_text("utf-8"), re.DOTALL)
+    assert code.count(ENDPOINT) == 1
+    here = code.replace(ENDPOINT, hauling.endpoint).replace('"paper"', repr(NAME))
     ended = subprocess.run([sys.executable, "-c", here], capture_output=True, text=True, timeout=120, check=False)
     assert (ended.returncode, ended.stderr) == (0, "")
-    float(ended.stdout)  # a value, or NaN where nobody was
+    assert outline(ended.stdout) == outline(dedent(below)) or not below
+
+
+def outline(printed: str) -> list[str]:
+    """Lines without their numbers and names of road sections."""
+    return [re.sub(r"[-\d._]+[ens]?\b|nan", "#", line) for line in printed.splitlines()]
+
+
+@pytest.mark.processes
+def test_what_the_readme_asks_of_a_running_site_is_answered(hauling: WebSite, tmp_path: Path):
+    """Its commands in one process each, but for those that start or simulate something."""
+    blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
+    lines = [shlex.split(line, comments=True) for line in "".join(blocks).splitlines()]
+    asked = [
+        words for words in lines if words[:2] in (["sitegrid", "query"], ["sitegrid", "plot"], ["sitegrid", "export"])
+    ]
+    assert len(asked) == 7
+    for _, *words in asked:
+        command = [sys.executable, "-m", "sitegrid", *words, "--endpoint", hauling.endpoint, "--site", NAME]
+        ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+        assert ended.returncode == 0, ended.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"map.png", "map.tif"}
+
+
+@pytest.mark.nightly
+def test_the_documents_build_without_a_warning(tmp_path: Path):
+    pytest.importorskip("myst_parser")
+    command = [sys.executable, "-m", "sphinx", "--quiet", "--fail-on-warning", "-c", "docs", ".", tmp_path]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+    assert (built.returncode, built.stderr) == (0, "")
+    assert "sitegrid.Client.point" in (tmp_path / "docs" / "api.html").read_text("utf-8")

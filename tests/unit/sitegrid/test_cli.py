@@ -37,16 +37,32 @@ def test_linear_algebra_gets_one_core_unless_told_otherwise(set_to, is_then, mon
     assert os.environ["OPENBLAS_NUM_THREADS"] == is_then
 
 
-def test_every_command_in_the_readme_is_one_that_the_parser_takes(root: Path, monkeypatch, tmp_path: Path):
+def test_every_command_in_the_documents_is_one_that_the_parser_takes(root: Path, monkeypatch, tmp_path: Path):
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```sh\n(.*?)```", (root / "README.md").read_text(), re.DOTALL)
-    lines = [shlex.split(line, comments=True) for line in "".join(blocks).splitlines()]
-    commands = [[word for word in words[1:] if word != "&"] for words in lines if words[:1] == ["sitegrid"]]
-    assert {"router", "server", "agent", "web", "sim", "query", "plot", "export", "record", "demo", "log"} == {
-        words[0] for words in commands
+    pages = [root / "README.md", *(page for top in ("docs", "examples") for page in sorted((root / top).rglob("*.md")))]
+    parser, asked = command_line.build_parser(), set()
+    for page in pages:
+        blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)
+        for line in "".join(blocks).splitlines():
+            for part in re.split(r"&& |[|&;>$]|\.\.\.", line):  # of what the shell does, only the commands
+                if part.lstrip().startswith("sitegrid "):
+                    _, *words = shlex.split(part, comments=True)
+                    asked.add(words[0])
+                    parser.parse_args(words)  # a usage error exits, and fails the test
+    assert asked >= {
+        "router",
+        "server",
+        "agent",
+        "web",
+        "sim",
+        "query",
+        "plot",
+        "export",
+        "log",
+        "probe",
+        "up",
+        "doctor",
     }
-    for words in commands:
-        command_line.build_parser().parse_args(words)  # a usage error exits and fails the test
 
 
 BEYOND_BASE = {"cryptography", "cv2", "filterpy", "matplotlib", "numba", "pyarrow", "pybullet", "pyproj", "rich"}

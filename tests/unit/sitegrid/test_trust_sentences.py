@@ -49,7 +49,7 @@ def test_a_wrong_reference_torque_is_one_sentence_once_the_ground_shows_it(gain:
             CALIBRATED,
             (
                 "beyond its data sheet: torque reads 1.49 times what it should, accelerometer -0.0034 off; "
-                "a person may let it in"
+                "a person may trust it"
             ),
         ),
         (("gain", "stuck"), {"gain": 0.6}, "measures 0.60 times the resistance that the others do; stuck"),

@@ -46,6 +46,6 @@ const kinds = () => element("ul", { className: "kinds" }, KINDS.map(({ name, rgb
   element("li", {}, swatch(css(rgb)), name, element("span", {}, short(value)))));
 
 function unknown(differs) {
-  const driven = differs ? [" at one of the times"] : [element("i", { className: "driven" }), "Driven only"];
+  const driven = differs ? [" at one of the times"] : [element("i", { className: "driven" }), "Driven, not measured"];
   return element("p", { className: "unknown" }, element("i", {}), "Unknown", ...driven);
 }

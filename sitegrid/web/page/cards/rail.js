@@ -5,7 +5,7 @@ import { choices } from "../state/index.js";
 
 export const SHOWS = [["machines", "Machines", "M"], ["tracks", "Tracks, last minute", "T"],
   ["changes", "Changed ground", "G"], ["lanes", "Lanes", "N"], ["plan", "Site picture", "P"],
-  ["unsure", "Fade what is unsure", "U"], ["old", "Fade what is old", "O"]];
+  ["unsure", "Fade uncertain", "U"], ["old", "Fade old", "O"]];
 
 export function buildRail() {
   byId("layers").append(...LAYERS.map((layer) =>

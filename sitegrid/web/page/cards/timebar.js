@@ -28,7 +28,7 @@ export function showTimebar() {
   slider.setAttribute("aria-valuetext", ns ? `${day(ns)} ${clock(ns)} UTC` : "no time known");
   second.hidden = mode === "one";
   if (other !== null && times.step_ns) second.value = times.stepOf(other);
-  byId("compare").textContent = { one: "Compare", beside: "Beside", difference: "Difference" }[mode];
+  byId("compare").textContent = { one: "Compare", beside: "Side by side", difference: "Difference" }[mode];
   byId("compare").setAttribute("aria-pressed", mode !== "one");
   byId("live").setAttribute("aria-pressed", at === null);
   byId("play").setAttribute("aria-label", times.playing ? "Pause" : "Play");

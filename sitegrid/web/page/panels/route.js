@@ -22,7 +22,7 @@ const STEPS = 120; // of a profile: about two pixels each
 const FARTHEST_M = 1e6; // of a place in a link
 const KEYS = "By keyboard: move the map with the arrows, "
   + "Enter sets a place at the cross, Backspace takes the last one back.";
-const DEAR = "as dear as the dearest tenth of the ground around.";
+const DEAR = "assumed as bad as the worst tenth of the ground nearby.";
 const TERMS = "Ranges hold 90 %. Slipping wheels take more: 1 to 4 % on firm ground, 10 % in sand.";
 // mass_t: null for the machine's usual one. at: the place that is pointed at in the profile.
 export const route =

@@ -15,35 +15,42 @@ const NEAR_PX = 14; // of a stretch's line, where a click is meant for it
 const ROOM_M = 40; // around a stretch that the view flies to
 const CLEAR_TREND = 0.001; // of resistance a day: less is not worth a foreman's time
 const DAY_NS = 86400e9, CHART_PX = 32;
+const LEAST_H = 0.5; // of traffic, for rates per hour: less does not say what an hour costs
 const ASIDE_PX = [[0, 0], [0, -22], [0, 22], [24, 0], [-24, 0], [24, -22], [-24, 22]]; // of a stretch: its number
 const NO_ROADS = "No roads are known yet. They appear where machines drive over the same ground again.";
 const GUESSED = "No machine said what it weighs where a number has a ~: what is lost there is a guess.";
 const TIES = "Those that cost nearly the same may stand in either order.";
-// target: resistance of good ground. lit: the stretch that is pointed at, on the map and in the list.
-export const work = { target: 0.02, rows: [], changes: [], lit: null };
+// target: resistance of good ground. hours: of traffic. lit: the stretch that is pointed at, on map and list.
+export const work = { target: 0.02, rows: [], changes: [], hours: 0, lit: null };
 const small = (text) => element("small", {}, text), bold = (text) => element("b", {}, text);
 
 export async function build(signal) {
   const asked = { target: work.target, limit: MOST, as_of: times.asOf };
   const answer = await getJson(site.path("worklist"), asked, signal);
-  Object.assign(work, { rows: answer.rows, changes: answer.changes.slice(0, MOST_CHANGES) });
+  Object.assign(work, { hours: answer.hours, rows: answer.rows, changes: answer.changes.slice(0, MOST_CHANGES) });
   return [head(answer), answer.rows.length ? list(answer.rows) : null, work.changes.length ? changed() : null];
 }
 
 function head({ rows, total_kwh_ph: total, hours }) {
-  const against = element("label", { className: "note field" }, "Good ground rolls at", targetField(), "% of weight");
+  const label = { className: "note field" };
+  const against = element("label", label, "Target rolling resistance", targetField(), "% of weight");
   if (!rows.length) {
     const none = `No stretch is worse than ${percent(work.target)} beyond doubt. Nothing for the grader to do.`;
     return section(element("p", { className: "say empty" }, hours ? none : NO_ROADS), against);
   }
   const sum = (name) => rows.reduce((all, row) => all + row[name][0], 0), lost = sum("kwh_ph");
+  const since = hours < 1.5 ? `${Math.round(60 * hours)} minutes` : `${figure(hours)} hours`;
+  const short = `From ${since} of traffic. Losses per hour are shown after 30 minutes.`;
+  if (isShort()) return section(note(short), against);
   return section(element("div", { className: "totals" },
     amount(figure(lost), "kWh/h", rows.length === 1 ? "lost on this one" : `lost on these ${rows.length}`),
     amount(Math.round(100 * Math.min(1, lost / Math.max(total, 1e-9))), "%", "of all that is lost"),
     amount(figure(sum("litres_ph")), "L/h", "of diesel, about")),
+  note(`Calculated from ${since} of traffic.`),
   rows.some((row) => row.segment.guessed) ? element("p", { className: "note guess" }, GUESSED) : null, against);
 }
 
+const isShort = () => work.hours < LEAST_H;
 const isTarget = (target) => target > 0 && target <= 1;
 
 function targetField() {
@@ -56,7 +63,7 @@ function targetField() {
 }
 
 const list = (rows) => element("section", { className: "part stretches" },
-  element("h3", { className: "cap" }, "Worst first", bold("kWh lost an hour")),
+  element("h3", { className: "cap" }, "Worst first", isShort() ? "" : bold("kWh lost an hour")),
   element("ol", {}, rows.map((row, i) => element("li", {}, stretch(row, i + 1)))),
   rows.some((row, i) => i && row.rank === rows[i - 1].rank) ? note(TIES) : null);
 
@@ -69,11 +76,12 @@ function stretch(row, place) {
   const costs = `${figure(row.litres_ph[0])} L, ${Math.round(row.seconds_ph[0])} s`;
   const rolls = () => `${percent(resistance)} ${kindAt(resistance, site.boundaries).name}`;
   const passes = passes_ph[0] + passes_ph[1], change = `${trend > 0 ? "+" : "−"}${percent(Math.abs(trend))}/day`;
-  const driven = `${Math.round(length_m)} m, ${passes.toFixed(passes < 9.95 ? 1 : 0)} passes/h`;
+  const rate = `${passes.toFixed(passes < 9.95 ? 1 : 0)} passes/h`, count = Math.round(passes * work.hours);
+  const driven = `${Math.round(length_m)} m, ${isShort() ? `${count} passes` : rate}`;
   return flier(`stretch-${id}`, "stretch", id, line, element("span", { className: "place" }, `${place}`),
     element("span", {}, bold(resistance === null ? "not measured" : rolls()), small(driven), small(since(row))),
     element("span", { className: "days" }, sparkline(row), Math.abs(trend) < CLEAR_TREND ? null : small(change)),
-    element("span", { className: "lost" }, bold(`${guessed ? "~" : ""}${figure(kwh)}`),
+    isShort() ? null : element("span", { className: "lost" }, bold(`${guessed ? "~" : ""}${figure(kwh)}`),
       small(`${figure(low)} to ${figure(high)}`), small(costs), segment.fuel ? small(burned(segment.fuel)) : null));
 }
 
@@ -125,7 +133,7 @@ function changed() {
     return element("li", {}, flier(`changed-${id}-${seen_ns}`, "stretch short", id, line,
       element("span", {}, bold(after < before ? "Repaired" : "Became worse"), small(when(first_ns))),
       element("span", { className: "lost" }, bold(`${percent(before)} → ${percent(after)}`),
-        small(Math.abs(saved) < 0.005 ? "" : cost))));
+        small(isShort() || Math.abs(saved) < 0.005 ? "" : cost))));
   });
   return part("Changed lately", "", element("ul", { className: "stretches" }, rows));
 }

@@ -245,7 +245,7 @@ def test_zero_grows_unsure_as_time_passes_but_never_more_than_at_first(age_s: fl
     assert math.sqrt(ss) == pytest.approx(1e-2)
 
 
-# --- closed tours ----------------------------------------------------------------------------------------------------
+# --- closed loops ----------------------------------------------------------------------------------------------------
 
 
 def tour(zero: float, seconds: float = 0.0, std: float = 1e-3) -> Tour:

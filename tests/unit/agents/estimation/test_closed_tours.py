@@ -1,4 +1,4 @@
-"""Closed tours: the accelerometer's zero from returning to a place."""
+"""Closed loops: the accelerometer's bias from returning to a place."""
 
 from __future__ import annotations
 

@@ -28,15 +28,15 @@ def test_each_zone_has_its_colour_filled_gaps_are_pale_and_unknown_is_grey():
     known, filled = np.array([[*zones, NAN, NAN]]), np.array([[*zones, ZONES[4].c_rr, NAN]])
     image = draw_resistance(region(7, 1, resistance=known, resistance_filled=filled))
     shown = [cell_colour(image, column, 0, 1, plotter.MAX_CELL_PX) for column in range(7)]
-    pale = tuple(round(0.42 * part + 0.58 * 255) for part in ZONES[4].bgr)
-    assert shown == [*(zone.bgr for zone in ZONES), pale, plotter.UNKNOWN_COLOUR]
+    pale = tuple(round(0.42 * part + 0.58 * 255) for part in plotter.GROUND_COLOURS[4])
+    assert shown == [*plotter.GROUND_COLOURS, pale, plotter.UNKNOWN_COLOUR]
 
 
 def test_slope_is_red_uphill_and_downhill():
     east = np.array([[0.0, 0.27, -0.27, 0.1, NAN]])
     image = draw_grade(region(5, 1, grade_east=east, grade_north=0.0))
     corner = [tuple(image[frame.TOP + 3, frame.LEFT + 64 * column + 3]) for column in range(5)]
-    flat, slope = ZONES[0].bgr, ZONES[1].bgr
+    flat, slope = plotter.EASY, plotter.HARD
     assert corner == [flat, slope, slope, flat, plotter.UNKNOWN_COLOUR]
 
 
@@ -44,7 +44,7 @@ def test_wrong_cells_are_loud():
     values = np.array([[0.008, 0.008, 0.25, NAN]])
     image = draw_difference(region(4, 1, resistance=values), {"resistance": np.full((1, 4), 0.008)}, "resistance")
     shown = [cell_colour(image, column, 0, 1, plotter.MAX_CELL_PX) for column in range(4)]
-    pale = plotter._pale(ZONES[0].bgr)
+    pale = plotter._pale(plotter.GROUND_COLOURS[0])
     assert shown == [pale, pale, plotter.WRONG_COLOUR, plotter.UNKNOWN_COLOUR]
 
 
@@ -66,14 +66,14 @@ def test_track_has_its_colour_and_a_marker_at_its_end():
     image = draw_resistance(region(100, 50, resistance=0.04), [track])
     assert cell_colour(image, 90, 40, 50, 12) == plotter.TRACK_COLOURS[0]
     assert min(cell_colour(image, 30, 10, 50, 12)) > 150  # a thin white line, smoothed
-    assert cell_colour(image, 70, 25, 50, 12) == ZONES[2].bgr  # NaN breaks the line
+    assert cell_colour(image, 70, 25, 50, 12) == plotter.GROUND_COLOURS[2]  # NaN breaks the line
 
 
 def test_grade_difference_takes_a_region_as_truth():
     here = region(2, 2, grade_east=0.3, grade_north=0.0)
     truth = region(2, 2, grade_east=0.0, grade_north=-0.3)
     image = draw_difference(here, truth, "grade")
-    assert cell_colour(image, 1, 1, 2, 64) == plotter._pale(ZONES[1].bgr)
+    assert cell_colour(image, 1, 1, 2, 64) == plotter._pale(plotter.HARD)
 
 
 def test_side_by_side_pads_the_smaller():

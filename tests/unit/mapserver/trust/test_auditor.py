@@ -154,7 +154,7 @@ HONEST = {
     "alike": [GOOD] * 4,
     "one far better": [{"std_m": 0.05}] + [{"std_m": 2.5}] * 3,
     "scales of 5 %": [{"gain": 0.95}, GOOD, GOOD, {"gain": 1.05}],
-    "zero errors on concrete": [{"zero": z, "site": 0 * SITE} for z in (0.0, 0.0, 0.003)],
+    "biases on concrete": [{"zero": z, "site": 0 * SITE} for z in (0.0, 0.0, 0.003)],
     "stuck where nothing varies": [{"site": DIRT}] * 3 + [{"site": DIRT, "stuck": 0.04}],
     "repaved for all": [{"later": (600.0, WETTER)}] * 3,
     "two against two": [GOOD, GOOD, {"gain": 1.6}, {"gain": 1.6}],

@@ -91,7 +91,7 @@ BAD = {
     CHANGE.format(at_s=0.0, soil="sand"): r"change\[0\]: at_s: 0.0 is not positive",
     '[[route]]\nname = "r"\n[[route.leg]]\ncorners = [[30, 30], [60, 30]]\n'
     "[[route.leg]]\ncorners = [[60, 30], [30, 30]]\nreverse = true\n"
-    '[[fleet]]\nname = "a"\nroutes = ["r"]\nother_way = true': "other_way: route 'r' is no closed tour",
+    '[[fleet]]\nname = "a"\nroutes = ["r"]\nother_way = true': "other_way: route 'r' is no closed loop",
     '[[preset]]\nname = "x"\nbase = "dgps"\ngps = { drift = 1 }': "drift",
 }
 

@@ -32,6 +32,7 @@ from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES, NamedMachine
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
+from sitegrid.answer_text import _value, _worded
 from sitegrid.cli import main
 from sitegrid.client import Client
 from sitegrid.command_line import build_parser
@@ -135,15 +136,15 @@ def test_a_worklist_is_a_table_with_what_changed_below(session: Session, capsys)
     assert main(["query", "worklist", "--target", "0.03", "--as-of", str(T0)]) == 0
     assert session.asked[-1] == WorklistQuery(0.03, as_of_ns=T0)
     head, names, row, changed = capsys.readouterr().out.splitlines()
-    assert head == "4.50 kWh/h lost on all roads against a resistance of 0.02, traffic of 1.50 h"
-    assert names.split()[:3] == ["stretch", "around", "kWh/h"]
+    assert head == "4.50 kWh/h lost on all roads against a resistance of 0.02, calculated from 90 minutes of traffic"
+    assert names.split()[:3] == ["section", "around", "kWh/h"]
     assert row.split()[:5] == ["1", "3_-2_e", "80,", "-44", "3.50"]
     assert "3.25..3.75" in row
     assert "3_-2_e: resistance 0.0625 -> 0.03125, saves 2.50 kWh/h" in changed
     assert main(["query", "worklist", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rows"][0]["segment"]["id"] == "3_-2_e"
     assert main(["query", "worklist", "--from", str(T0)]) == 0
-    assert "no stretch is worse for sure" in capsys.readouterr().out
+    assert "no section is worse beyond doubt" in capsys.readouterr().out
 
 
 def test_a_route_is_its_totals_and_a_table_of_steps(session: Session, capsys):
@@ -309,7 +310,30 @@ def test_a_history_is_a_table_for_people(session: Session, capsys):
         "2025-06-15 15:11:40Z  0.5         3",
     ]
     main(["query", "history", "-1", "2"])
-    assert capsys.readouterr().out == "nobody was there\n"
+    assert capsys.readouterr().out == "nothing is driven yet\n"
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(math.nan, "unknown"), (-0.0, "0"), (-1e-9, "-1e-09"), (2.0, "2")],
+)
+def test_a_value_for_people_has_no_minus_zero(value: float, shown: str):
+    assert _value(value) == shown
+
+
+def test_values_have_units_and_classes_their_names(session: Session):
+    classes = {"resistance_class": ("concrete", "gravel"), "slope_class": ("flat", "slope")}
+    worded = [_worded(*pair, classes) for pair in (("grade", -0.02), ("resistance_class", 1.0), ("slope_class", 0.0))]
+    assert worded == ["-0.02 m/m", "1, gravel", "0, flat"]
+    assert _worded("resistance_class", math.nan, classes) == "unknown"
+
+
+@pytest.mark.parametrize(("words", "meant"), [("quer", "query or router"), ("query pont", "point or points")])
+def test_a_mistyped_word_names_those_that_it_may_mean(capsys, words: str, meant: str):
+    with pytest.raises(SystemExit) as end:
+        main(words.split())
+    assert end.value.code == 2
+    assert capsys.readouterr().err.endswith(f"did you mean {meant}?\n")
 
 
 def test_a_probe_is_one_line_or_one_object(session: Session, capsys):
