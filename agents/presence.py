@@ -49,7 +49,7 @@ class Presence:
 
     @property
     def owner(self) -> Owner:
-        """This agent."""
+        """The agent itself."""
         return self._owner
 
     def look_around(self) -> Owner | None:

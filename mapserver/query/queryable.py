@@ -40,8 +40,9 @@ class AnswerPool:
     """
 
     def __init__(self, name: str, threads: int, budget: int, spare: Callable[[], float] | None = None) -> None:
-        """budget: total size of waiting and running tasks. spare: done by one thread while none waits; returns the
-        seconds until it is due again.
+        """budget: total size of tasks, waiting and running.
+
+        spare: one thread does it while no task waits; returns the seconds until it is due again.
         """
         self._budget, self._size = budget, 0
         self._spare, self._spare_s = spare, 0.0 if spare else math.inf  # when it is due; infinite while it is done
@@ -178,14 +179,10 @@ class MapQueryable:
 
     def __init__(self, session: zenoh.Session, key: str, source: MapSource, answers: Answers) -> None:
         self._source, self._answers, self._replies = source, answers, Replies(source)
-
-    def __init__(self, name: str, threads: int, budget: int, spare: Callable[[], float] | None = None) -> None:
-        """budget: total size of waiting and running tasks. spare: done by one thread while none waits; returns the
-        seconds until it is due again.
-        """
-        self._budget, self._size = budget, 0
-        self._spare, self._spare_s = spare, 0.0 if spare else math.inf  # when it is due; infinite while it is done
-        self._waiting: dict[int, Work] = {}  # by number, oldest first
+        self._now = AnswerPool("query", source.config.query_threads, ANSWER_BYTES, source.waits.time_out)
+        self._past = AnswerPool("past", 1, MOST_PAST)  # apart, so that a fold of the past never delays the current map
+        answers.begin()
+        self._large = AnswerPool("large", 1, ANSWER_BYTES, answers.renew)  # one large answer at a time; then roads
         self._queryable = session.declare_queryable(key, self._on_query)
 
     def stop(self) -> None:
