@@ -42,6 +42,8 @@ class ReadingsRecorder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """ModuleNotFoundError without the extra `record`; OSError for an impossible folder."""
+        import mcap.writer  # noqa: F401 - now, not at the first reading
+
         self._folder, self._file_bytes = Path(config.folder), config.max_mb * 1e6 / FILES
         self._machine, self._sensors = machine.name, {sensor.name for sensor in machine.sensors}
         self._about = {"site": site, "machine": machine.name}

@@ -1,1 +1,1 @@
-"""Corrections of a base station for receivers: RTCM3 from a base or a caster, over Zenoh, to the receivers' ports."""
+"""Base station corrections for receivers: RTCM3 from a base or caster, over Zenoh, to receiver ports."""

@@ -1,4 +1,4 @@
-"""Corrections to the ports of a machine's receivers: what comes in on the key of its base is checked and written on."""
+"""Corrections to a machine's receivers: messages on its base's key are checked and written to the ports."""
 
 import threading
 import time
@@ -17,18 +17,18 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_corrections
 from protocol.wire.messages import Corrections
 
-WAITING = 50  # messages while a port holds the thread up: some seconds; then the oldest gives way
-STALE_NS = 60 * 10**9  # receivers give their fixed solution up after 30 to 60 s
-FOLLOWS = 100  # clocks that run apart by up to a hundredth make no correction old
-DRAINED = 64  # pieces at a time of what a receiver sends on a port that nobody reads
+WAITING = 50  # capacity in messages while a port blocks: some seconds; the oldest is dropped
+STALE_NS = 60 * 10**9  # receivers lose their fixed solution after 30 to 60 s
+FOLLOWS = 100  # inverse of the clock drift that makes no correction old
+DRAINED = 64  # pieces read at a time from a port that nobody reads
 
 
 @dataclass(frozen=True)
 class CorrectionsConfig:
-    """Corrections for the receivers of a machine.
+    """Corrections for a machine's receivers.
 
-    base: whose; empty for none. ports: where they are written: addresses of [[driver]] tables, other serial ports, or
-    `tcp://HOST:PORT`. baud: of those serial ports.
+    base: its name; empty for none. ports: addresses of [[driver]] tables, other serial ports, or `tcp://HOST:PORT`.
+    baud: of serial ports.
     """
 
     base: str = ""
@@ -46,21 +46,21 @@ class CorrectionPort(Protocol):
     """Where a receiver takes corrections."""
 
     def write(self, data: bytes) -> object:
-        """Send bytes to the receiver; OSError where that fails."""
+        """Send bytes; OSError."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Release it."""
 
 
 class OwnPort:
-    """A port for corrections alone. It is opened when some come in, and again with the next ones where it broke."""
+    """A port for corrections alone, opened, or reopened, when some arrive."""
 
     def __init__(self, address: str, baud: int) -> None:
         self._address, self._baud = address, baud
         self._transport: Transport | None = None
 
     def write(self, data: bytes) -> None:
-        """Send bytes; what the receiver has sent is let go."""
+        """Send bytes; the receiver's output is discarded."""
         try:
             self._transport = self._transport or open_transport(self._address, self._baud)
             for _ in range(DRAINED):
@@ -72,7 +72,7 @@ class OwnPort:
             raise
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
         if self._transport:
             self._transport.close()
         self._transport = None
@@ -80,11 +80,10 @@ class OwnPort:
 
 @dataclass(frozen=True)
 class CorrectionsState:
-    """What is known of a base: pure. since_ns: of the machine's monotonic clock, as all times but stamps.
+    """State of a base, pure; all times but stamps by the machine's monotonic clock.
 
-    heard_ns: when the relay last said anything. true_ns: when the newest frame reached the relay, None without one.
-    fastest_ns: the least that arrivals are ahead of stamps. Two clocks are apart by that, and by the fastest way; so a
-    message that was held up shows, and a wrong clock does not.
+    heard_ns: last message of the relay. true_ns: when the newest frame reached the relay, or None. fastest_ns: least
+    lag of arrivals behind stamps, clock offset included; so late messages show, and wrong clocks do not.
     """
 
     base: str
@@ -95,7 +94,7 @@ class CorrectionsState:
     said: str = ""
 
     def after(self, message: Corrections, came_ns: int) -> "CorrectionsState":
-        """The state after a message that came in."""
+        """The state after a message."""
         behind_ns = fastest_ns = came_ns - message.stamp_ns
         if self.heard_ns is not None:
             followed_ns = self.fastest_ns + (came_ns - self.heard_ns) // FOLLOWS
@@ -105,7 +104,7 @@ class CorrectionsState:
         return replace(self, heard_ns=came_ns, true_ns=true_ns, fastest_ns=fastest_ns, said=message.problem)
 
     def problem(self, now_ns: int) -> str:
-        """Why receivers have no corrections, in a sentence; empty while they have."""
+        """Why receivers lack corrections, or ""."""
         age_ns = now_ns - (self.since_ns if self.true_ns is None else self.true_ns)
         if self.said:
             return f"{self.base}: {self.said}"
@@ -117,7 +116,7 @@ class CorrectionsState:
 
 
 class CorrectionsDelivery:
-    """Writes the corrections of one base to all ports, by address, from a thread that a port may hold up."""
+    """Writes one base's corrections to all ports, on a thread that a port may block."""
 
     def __init__(
         self,
@@ -130,20 +129,20 @@ class CorrectionsDelivery:
         self._ports, self._clock_ns = dict(ports), clock_ns
         self._counters: Counter[str] = Counter()
         self._state = CorrectionsState(base, clock_ns())
-        self._failed: dict[str, str] = {}  # ports
+        self._failed: dict[str, str] = {}
         self._subscriber = session.declare_subscriber(keys.corrections(site, base), zenoh.handlers.RingChannel(WAITING))
         self._thread = threading.Thread(target=self._run, name="corrections", daemon=True)
         self._thread.start()
 
     def report(self) -> dict[str, Any]:
-        """How old the newest frame is, what was refused, and what hinders it, in plain values."""
+        """Age of the newest frame, refusals and problems, in plain values."""
         now_ns, state = self._clock_ns(), self._state
         problems = [why for why in (state.problem(now_ns), *dict(self._failed).values()) if why]
         age_s = None if state.true_ns is None else round((now_ns - state.true_ns) * 1e-9, 1)
         return {"base": state.base, "age_s": age_s, "problem": "; ".join(problems), "counters": dict(self._counters)}
 
     def close(self) -> None:
-        """Stop listening, and give the ports back."""
+        """Stop listening, release the ports."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._thread.join()
         for port in self._ports.values():
@@ -175,6 +174,6 @@ class CorrectionsDelivery:
 def open_delivery(
     session: zenoh.Session, site: str, config: CorrectionsConfig, open_ports: Mapping[str, CorrectionPort]
 ) -> CorrectionsDelivery | None:
-    """Begin to write corrections, where a machine takes some. open_ports: those that drivers read, by address."""
+    """Start delivery, if configured. open_ports: those of drivers, by address."""
     ports = {address: open_ports.get(address) or OwnPort(address, config.baud) for address in config.ports}
     return CorrectionsDelivery(session, site, config.base, ports) if ports else None

@@ -1,7 +1,7 @@
-"""The stream of a mountpoint on an NTRIP caster, versions 1 and 2 (RTCM 10410), with or without TLS.
+"""Stream of an NTRIP caster's mountpoint, versions 1 and 2 (RTCM 10410), with or without TLS.
 
-It is read like any other link: OSError or LinkError where it broke or the caster refuses, and it is for the reader to
-open another one. What waits in here is bounded: the caster's answer, and the line before a chunk.
+OSError or LinkError if it breaks or the caster refuses; the reader opens another. Buffers are bounded: the caster's
+answer, and the line before a chunk.
 """
 
 import re
@@ -19,17 +19,17 @@ from protocol.version import package_version
 
 PORTS = {"ntrip": 2101, "ntrips": 443}
 PIECE_BYTES = 4096
-CONNECT_S = 10.0  # also for the whole answer: casters stand behind mobile networks
-SILENT_S = 60.0  # a base sends every second; a link without a byte for so long is dead
-POSITION_S = 10.0  # networks of bases compute for the place of the last GGA
-MAX_ANSWER_BYTES = 16_384  # of an answer's head; of a list of mountpoints its beginning will do
-MAX_NAMED = 5  # mountpoints in a sentence
+CONNECT_S = 10.0  # timeout, also of the answer, for mobile networks
+SILENT_S = 60.0  # bases send every second; a link silent for so long is dead
+POSITION_S = 10.0  # interval of GGA, for networks of bases
+MAX_ANSWER_BYTES = 16_384  # of an answer's head, or of a list of mountpoints
+MAX_NAMED = 5  # mountpoints named in a sentence
 _CHUNK = re.compile(rb"[ \t]*([0-9a-fA-F]{1,7})[ \t]*(;[^\n]*)?\r?")
 
 
 @dataclass(frozen=True)
 class Caster:
-    """A mountpoint, and who asks for it. is_encrypted: with TLS."""
+    """A mountpoint and its user. is_encrypted: with TLS."""
 
     host: str
     port: int
@@ -43,7 +43,7 @@ class Caster:
 
 
 def parse_caster(address: str, user: str = "", password: str = "") -> Caster:
-    """The caster of `ntrip://HOST[:PORT]/MOUNTPOINT`, with TLS of `ntrips://`; ConfigError where it is none."""
+    """Parse `ntrip://HOST[:PORT]/MOUNTPOINT`, or `ntrips://` with TLS; ConfigError."""
     parts = urlsplit(address)
     try:
         port = parts.port or PORTS.get(parts.scheme)
@@ -58,7 +58,7 @@ def parse_caster(address: str, user: str = "", password: str = "") -> Caster:
 
 
 def gga(latitude_deg: float, longitude_deg: float, height_m: float, now: datetime) -> str:
-    """A place as NMEA has it: GGA with a fix."""
+    """A position as an NMEA GGA sentence with a fix."""
     parts = [f"GPGGA,{now:%H%M%S}.00"]
     for angle_deg, signs, digits in ((latitude_deg, "NS", 2), (longitude_deg, "EW", 3)):
         degrees, millionths = divmod(round(abs(angle_deg) * 60e6), 60_000_000)
@@ -72,7 +72,7 @@ def gga(latitude_deg: float, longitude_deg: float, height_m: float, now: datetim
 
 
 class NtripStream:
-    """An open stream. place: latitude, longitude [deg] and height [m] that the caster is told, None to tell none."""
+    """An open stream. place: latitude, longitude [deg], height [m] sent to the caster, or None."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class NtripStream:
         self._waiting = rest
 
     def read(self, timeout_s: float) -> bytes:
-        """Bytes that have come in, empty if none came; OSError or LinkError where the link broke."""
+        """New bytes, maybe none; OSError or LinkError if the link broke."""
         self._state_place()
         data, self._waiting = self._waiting or self._receive(timeout_s), b""
         if data:
@@ -109,7 +109,7 @@ class NtripStream:
         self._socket.close()
 
     def _receive(self, timeout_s: float) -> bytes:
-        self._socket.settimeout(max(timeout_s, 0.001))  # 0 would not wait for the rest of a record of TLS
+        self._socket.settimeout(max(timeout_s, 0.001))  # 0 would not wait for the rest of a TLS record
         try:
             data = self._socket.recv(PIECE_BYTES)
         except TimeoutError:
@@ -125,7 +125,7 @@ class NtripStream:
             self._socket.sendall(f"{gga(*self._place, datetime.now(UTC))}\r\n".encode())
 
     def _answer(self) -> tuple[bytes, bool]:
-        """Wait for the answer; returns what came behind it, and whether that is in chunks."""
+        """Await the answer; as `judge`."""
         answer, end_s = b"", self._clock() + CONNECT_S
         while (judged := judge(answer, self._caster, is_all=len(answer) > MAX_ANSWER_BYTES)) is None:
             if (left_s := end_s - self._clock()) <= 0:
@@ -140,11 +140,11 @@ class NtripStream:
 
 
 def judge(answer: bytes, caster: Caster, *, is_all: bool = False) -> tuple[bytes, bool] | None:
-    """Judge a caster's answer; returns what came behind it, and whether that is in chunks; None where more must come.
+    """Judge a caster's answer; returns the bytes behind it, and whether they are chunked; None if incomplete.
 
-    is_all: no more will come. LinkError says why the caster refuses.
+    is_all: no more will come. LinkError: why the caster refuses.
     """
-    status, has_head, body = answer.partition(b"\n")  # version 1: data may begin behind the first line
+    status, has_head, body = answer.partition(b"\n")  # version 1: data may follow the first line
     head = b""
     if is_http := status.startswith(b"HTTP/"):
         end = re.search(rb"\r?\n\r?\n", answer)
@@ -174,14 +174,14 @@ def judge(answer: bytes, caster: Caster, *, is_all: bool = False) -> tuple[bytes
 
 
 class Chunks:
-    """The bytes of a body that comes in chunks (RFC 9112, section 7.1)."""
+    """A chunked body's bytes (RFC 9112, section 7.1)."""
 
     def __init__(self) -> None:
-        self._left = 0  # bytes of a chunk, and of the line end behind it
+        self._left = 0  # bytes of a chunk and its line end
         self._line = b""
 
     def feed(self, data: bytes) -> bytes:
-        """The bytes in these; OSError at the end of the body, and where it is malformed."""
+        """Body bytes in these; OSError at the end, or if malformed."""
         body = bytearray()
         while data:
             if self._left:

@@ -1,7 +1,6 @@
-"""The relay: RTCM3 of one base, from its port or a caster, onto the key of the site.
+"""The relay: one base's RTCM3, from its port or a caster, onto the site's key.
 
-It opens what breaks again, a caster later each time, and says in a sentence what hinders it: machines have it in their
-health.
+It reopens broken links, casters with backoff; machines show its problem in their health.
 """
 
 import logging
@@ -23,20 +22,20 @@ from protocol.wire.messages import Corrections
 
 log = logging.getLogger("agents.corrections")
 
-GATHER_S = 0.1  # the frames of a second come together; the router lets through 50 messages a second
-MESSAGE_BYTES = 8192  # of frames in one, half of what is let through
-RETRY_S, MAX_RETRY_S = 1.0, 60.0  # casters shut out who comes too often
-STATE_S = 5.0  # without frames the relay says so often that it lives, and what hinders it
+GATHER_S = 0.1  # gathers a second's frames; the router admits 50 messages a second
+MESSAGE_BYTES = 8192  # of frames per message, half the admitted size
+RETRY_S, MAX_RETRY_S = 1.0, 60.0  # casters lock out frequent callers
+STATE_S = 5.0  # interval of the relay's state without frames
 UNFRAMED_S = 10.0
 
 
 @dataclass(frozen=True)
 class RelayConfig:
-    """Options of the relay of one base (config/corrections.toml).
+    """Options of a base's relay (config/corrections.toml).
 
-    name: of the base, as machines name it. source: a serial port, `tcp://HOST:PORT`, `ntrip://HOST[:PORT]/MOUNTPOINT`
-    or, with TLS, `ntrips://`. baud: of a serial port. user, password: of the caster. sends_position: whether it is told
-    the site's origin, as networks of bases need it.
+    name: of the base. source: a serial port, `tcp://HOST:PORT`, `ntrip://HOST[:PORT]/MOUNTPOINT` or, with TLS,
+    `ntrips://`. baud: of a serial port. user, password: of the caster. sends_position: send it the site's origin, for
+    networks of bases.
     """
 
     name: str
@@ -65,7 +64,7 @@ class RelayConfig:
 
 
 class Relay:
-    """Reads one base. problem: what hinders it now, empty where nothing does. wait: so long [s], or until stopped."""
+    """Reads one base. problem: current one, or "". wait: pause [s], ended by a stop."""
 
     def __init__(
         self,
@@ -84,7 +83,7 @@ class Relay:
         self._retry_s = RETRY_S
 
     def run(self, stop: Event) -> dict[str, Any]:
-        """Relay until stopped, or the stream ends as a file does; returns a report in plain values."""
+        """Relay until stopped or at the end of a file; returns a report in plain values."""
         while not stop.is_set() and self.step():
             pass
         self._say()
@@ -92,7 +91,7 @@ class Relay:
         return {"base": self._config.name, "problem": self.problem, **self.counters}
 
     def step(self) -> bool:
-        """Take what has come in, and publish what is due; False once nothing more will come."""
+        """Read input, publish what is due; False at the end."""
         try:
             self._stream = self._stream or self._opened()
             data = self._stream.read(0.1)
@@ -110,7 +109,7 @@ class Relay:
         return data is not None
 
     def close(self) -> None:
-        """Let go of the source."""
+        """Close the source."""
         if self._stream:
             self._stream.close()
         self._stream = None
@@ -142,7 +141,7 @@ class Relay:
         return "nothing comes: is the base on, and set to send RTCM3?"
 
     def _say(self) -> None:
-        """Publish the frames that wait, or that there are none."""
+        """Publish waiting frames, or that there are none."""
         parts = [b""]
         for frame in self._frames:
             if len(parts[-1]) + len(frame) > MESSAGE_BYTES:

@@ -1,11 +1,11 @@
-"""RTCM3 frames out of bytes: 0xD3, six zero bits, ten of length, a message, CRC-24Q (RTCM 10403, section 4). Pure."""
+"""RTCM3 frames: 0xD3, six zero bits, ten of length, message, CRC-24Q (RTCM 10403, section 4). Pure."""
 
 from functools import reduce
 
 from agents.drivers.formats.framing import Framer, Framing
 
 RTCM, PREAMBLE = "rtcm3", 0xD3
-AROUND = 3  # bytes of preamble and length before a message, and of the CRC behind it
+AROUND = 3  # bytes of preamble and length, or CRC
 POLYNOMIAL = 0x1864CFB
 MOST_BYTES = 1023 + 2 * AROUND
 
@@ -18,7 +18,7 @@ _TABLE = [_entry(byte) for byte in range(256)]
 
 
 def crc24q(data: bytes | bytearray) -> int:
-    """CRC-24Q; 0 of a whole frame with its CRC."""
+    """CRC-24Q; 0 for a whole frame with its CRC."""
     crc = 0
     for byte in data:
         crc = (crc & 0xFFFF) << 8 ^ _TABLE[crc >> 16 ^ byte]
@@ -26,7 +26,7 @@ def crc24q(data: bytes | bytearray) -> int:
 
 
 def _end(buffer: bytes | bytearray, start: int) -> int | None:
-    """Where a frame that begins at `start` ends, by its length; None where none begins there."""
+    """End of a frame beginning at `start`, by its length; None for no frame."""
     if buffer[start + 1 : start + 2] > b"\x03":
         return None
     if len(buffer) < start + AROUND:
@@ -38,17 +38,17 @@ RTCM_FRAMING = Framing(bytes([PREAMBLE]), MOST_BYTES, _end, lambda frame: not cr
 
 
 def rtcm_framer() -> Framer:
-    """Cuts a stream of bytes into frames; all bytes between them are broken ones."""
+    """A framer; all bytes between frames count as broken."""
     return Framer({RTCM: RTCM_FRAMING}, between=b"")
 
 
 def message_number(frame: bytes) -> int:
-    """The number of the message in a whole frame: 1005 has a base's place, 1074 to 1137 its observations."""
+    """Number of a frame's message: 1005 is a base's position, 1074 to 1137 observations."""
     return int.from_bytes(frame[AROUND : AROUND + 2], "big") >> 4
 
 
 def whole_frames(data: bytes) -> list[bytes]:
-    """Frames that lie end to end; ValueError at the first byte that begins none, so that nothing is looked at twice."""
+    """Adjacent frames; ValueError at the first byte that begins none."""
     frames, at = list[bytes](), 0
     while at < len(data):
         end = _end(data, at) if data[at] == PREAMBLE else None

@@ -1,7 +1,7 @@
-"""The driver door: simulation, replayed logs and real sensors enter an agent as the same stream of readings.
+"""The driver door: simulation, replay and real sensors enter an agent as one stream of readings.
 
-A `Driver` hands readings to the agent. A `Source` is what a [[driver]] table makes, ours or a plug-in's: its values
-have times of the host's monotonic clock, and `Sources` (agents/drivers/sources.py) makes readings of them, in UTC.
+A `Driver` gives readings. A `Source`, made by a [[driver]] table, built in or a plug-in, gives values with times of the
+host's monotonic clock; `Sources` (agents/drivers/sources.py) turns them into readings in UTC.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,10 +13,10 @@ Item = TypeVar("Item", covariant=True)
 
 
 class Observed(NamedTuple):
-    """Values of a sensor, before they are a reading.
+    """A sensor's values before they are a reading.
 
-    sensor: of the machine, empty where the time alone counts. host_ns: when they were true or arrived, by
-    `time.monotonic_ns`. utc_ns: when they were true by a receiver's clock, 0 where nothing states it.
+    sensor: of the machine, empty if only the time counts. host_ns: when measured or received, by `time.monotonic_ns`.
+    utc_ns: when measured, by a receiver's clock; 0 if unstated.
     """
 
     sensor: str
@@ -27,20 +27,20 @@ class Observed(NamedTuple):
 
 
 class Stream(Protocol[Item]):
-    """What comes in, in the order in which a machine has it: mostly that of its stamps. Bad input never raises."""
+    """Input in order of arrival, mostly that of stamps. Bad input never raises."""
 
     def read(self, timeout_s: float) -> Sequence[Item] | None:
-        """What has come in, nothing if nothing came within timeout_s, None once the stream has ended."""
+        """New items; empty after timeout_s, None at the end of the stream."""
 
     def counters(self) -> Mapping[str, int]:
-        """What was refused or lost on the way, by name."""
+        """What was refused or lost, by name."""
 
     def problems(self) -> Sequence[str]:
-        """What hinders it now, and what to do: a sentence each."""
+        """Current problems and remedies, a sentence each."""
 
     def close(self) -> None:
-        """Let go of ports, files and subscriptions."""
+        """Release ports, files, subscriptions."""
 
 
 Driver = Stream[Reading]
-Source = Stream[Observed]  # a thread of its own reads it
+Source = Stream[Observed]  # read on a thread of its own

@@ -1,4 +1,4 @@
-"""One line: bytes into values of sensors, by the streams that a [[driver]] table feeds them from. Pure."""
+"""One line: bytes to sensor values, by the streams of a [[driver]] table. Pure."""
 
 import math
 from collections import Counter
@@ -18,10 +18,10 @@ DECODERS: dict[str, Callable[[Collection[str]], Decoder]] = {NMEA: NmeaDecoder, 
 
 
 class Line:
-    """Bytes of one line in, values out.
+    """Decodes the bytes of one line.
 
-    format: whose frames are decoded. feeds: sensor by stream, `heading`, or `gp:fix` of one sender among several.
-    frames: whole ones by format. seen: the newest fix, or that there is none. has_fixes: whether a sensor takes them.
+    feeds: sensor by stream, `heading`, or `gp:fix` of one sender. frames: whole ones by format. seen: newest fix
+    message.
     """
 
     def __init__(self, format_: str, feeds: Mapping[str, SensorConfig]) -> None:
@@ -37,9 +37,9 @@ class Line:
         self._file_ns = 0
 
     def feed(self, data: bytes, host_ns: int | None, byte_ns: float = 0.0) -> list[Observed]:
-        """Values in these bytes, the last of which came at `host_ns`; without it they are a file's.
+        """Values in these bytes, the last of which came at `host_ns`; None for a file.
 
-        byte_ns: how long a byte took. A value came when its frame began; in a file, at the time stated before it.
+        byte_ns: duration of a byte. A value's time is its frame's begin; in a file, the last stated time.
         """
         observed: list[Observed] = []
         for frame in self._framer.feed(data):
@@ -51,7 +51,7 @@ class Line:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Frames read, by format; bytes that are in none; frames that were malformed; fixes that were none."""
+        """Frames by format, bytes in none, malformed frames, missing fixes."""
         frames = {f"frames_{name}": n for name, n in dict(self.frames).items()}
         return {**frames, "bytes_broken": self._framer.broken, **dict(self._counters)}
 
@@ -67,7 +67,7 @@ class Line:
         if host_ns is None:
             host_ns = self._file_ns = message.utc_ns or self._file_ns
             if not host_ns:
-                return None  # nothing in the file has stated the time yet
+                return None  # the file has not stated a time yet
         if message.tag_ns is not None:
             host_ns = self._undelayed_ns(message.stream, message.tag_ns, host_ns)
         if message.stream == TIME:
@@ -87,22 +87,22 @@ class Line:
         return Observed(sensor.name, STREAMS[message.stream], values, host_ns, message.utc_ns)
 
     def _undelayed_ns(self, stream: str, tag_ns: int, host_ns: int) -> int:
-        """When a tagged value would have come without what delays single frames."""
+        """Arrival of a tagged value without its delay."""
         tie = self._ties.setdefault(stream, ClockTie())
-        is_new = host_ns > tie.heard_ns or not self._file_ns  # in a file the first one after a time came just then
+        is_new = host_ns > tie.heard_ns or not self._file_ns  # in a file, only the first after a stated time came then
         if is_new and not tie.take(tag_ns, host_ns):
             return host_ns
         return host_ns if tie.offset_ns is None else tag_ns - tie.offset_ns
 
 
 def stated(values: tuple[float, ...], sensor: SensorConfig) -> tuple[float, ...]:
-    """Values of a sensor's kind, with its own variance where the sender states none."""
+    """Values with the sensor's own variance where the sender states none."""
     std = sensor.std.get(QUANTITIES.get(sensor.kind, ("",))[-1], math.nan)
     named = zip(values, columns(sensor.kind), strict=True)
     return tuple(std * std if math.isnan(value) and name.startswith("var_") else value for value, name in named)
 
 
 def split_stream(key: str) -> tuple[str, str]:
-    """Sender and stream of a key in `feeds`; the sender in lower case, empty where any is meant."""
+    """Sender (lower case, empty for any) and stream of a key in `feeds`."""
     source, _, stream = key.rpartition(":")
     return source.lower(), stream

@@ -1,4 +1,4 @@
-"""A receiver on a port: opens it, opens it again, finds its baud, and says in a sentence what hinders it."""
+"""A receiver on a port: opens and reopens it, finds its baud, and states its problem in a sentence."""
 
 import errno
 import logging
@@ -15,16 +15,16 @@ from agents.drivers.transports import Transport, open_transport, why_closed
 
 log = logging.getLogger("agents.drivers")
 
-BAUDS = (115_200, 9600, 38_400, 57_600, 230_400, 460_800, 921_600, 4800)  # by how usual they are
-RETRY_S = 1.0  # between two tries to open: one that is back is read within 2 s
-TRY_S = 2.5  # of bytes without a frame, then another baud is tried: receivers send each second
-SILENT_S = 5.0  # without a byte
-NO_FIX_S = 30.0  # of messages without a fix: a warm start takes less
-FOREIGN_FRAMES = 10  # of another format, and none of its own
+BAUDS = (115_200, 9600, 38_400, 57_600, 230_400, 460_800, 921_600, 4800)  # most usual first
+RETRY_S = 1.0  # between attempts to open: a returning one is read within 2 s
+TRY_S = 2.5  # of bytes without frames before another baud; receivers send each second
+SILENT_S = 5.0
+NO_FIX_S = 30.0  # of messages without a fix; a warm start takes less
+FOREIGN_FRAMES = 10  # of another format, none of its own
 
 
 class ReceiverSource:
-    """Source of one port. baud: 0 to find it. clock_ns, wait: the host's monotonic clock, and how to let time pass."""
+    """Source of one port. baud: 0 to find it. clock_ns, wait: monotonic clock and pause of the host."""
 
     def __init__(
         self,
@@ -39,13 +39,13 @@ class ReceiverSource:
         self._clock_ns, self._wait = clock_ns, wait
         self._counters: Counter[str] = Counter()
         self._transport: Transport | None = None
-        self._problem = ""  # of the link
-        self._bauds = list(dict.fromkeys((baud or BAUDS[0], *BAUDS)))  # the one in use comes first
+        self._problem = ""
+        self._bauds = list(dict.fromkeys((baud or BAUDS[0], *BAUDS)))  # the current one first
         self._retry_s, self._was_fixed = 0.0, False
         self._heard_s = self._framed_s = self._fixed_s = self._now_s()
 
     def read(self, timeout_s: float) -> Sequence[Observed] | None:
-        """Values that have come in; a link that breaks is opened again."""
+        """New values; a broken link is reopened."""
         try:
             transport = self._transport or self._open(timeout_s)
             data = transport.read(timeout_s) if transport else b""
@@ -64,28 +64,28 @@ class ReceiverSource:
         return observed
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the receiver, as corrections, from any thread; OSError while its link is not open."""
+        """Send bytes, such as corrections, from any thread; OSError without a link."""
         if not (transport := self._transport):
             raise OSError(errno.ENOTCONN, "its driver has no link")
         transport.write(data)
 
     def counters(self) -> Mapping[str, int]:
-        """Frames, broken bytes, and how often the link broke."""
+        """Frames, broken bytes, link failures."""
         return {**self._line.counters, **dict(self._counters)}
 
     def problems(self) -> Sequence[str]:
-        """What hinders it: the link first, then what comes over it."""
+        """Its problem: of the link, else of its messages."""
         problem = self._problem or self._why_unfixed()
         return [f"{self._address}: {problem}"] if problem else []
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
         if self._transport:
             self._transport.close()
         self._transport = None
 
     def _open(self, timeout_s: float) -> Transport | None:
-        """Open the port if it is time to."""
+        """Open the port, if due."""
         if (early_s := self._retry_s - self._now_s()) > 0:
             self._wait(min(early_s, timeout_s))
             return None
@@ -105,7 +105,7 @@ class ReceiverSource:
         self._tell(why)
 
     def _judge(self, *, has_frames: bool, is_live: bool) -> None:
-        """What the bytes that came say of the port."""
+        """Judge the port by new bytes."""
         self._heard_s = now_s = self._now_s()
         if has_frames:
             self._framed_s = now_s
@@ -119,12 +119,12 @@ class ReceiverSource:
         if not self._transport or self._now_s() - self._heard_s <= SILENT_S:
             return
         silent = "nothing comes: is it powered, wired, and set to send here?"
-        if self._address.startswith("tcp:"):  # a peer that lost its power never hangs up
+        if self._address.startswith("tcp:"):  # a peer without power never hangs up
             self._break(silent)
         self._tell(silent)
 
     def _try_another(self) -> None:
-        """Bytes without frames: take the next baud, where there is one."""
+        """Bytes without frames: switch to the next baud, if any."""
         self._framed_s = self._now_s()
         if "://" in self._address:
             self._tell("bytes come, but neither NMEA, UBX nor gpsd's: is it the right port?")
@@ -156,7 +156,7 @@ class ReceiverSource:
         return "waiting for its date" if seen.values else f"no fix yet: {seen.satellites} satellites"
 
     def _tell(self, problem: str) -> None:
-        """Log what is wrong, as it begins and as it ends."""
+        """Log a problem as it begins and ends."""
         if problem != self._problem:
             log.warning("receiver port=%s problem=%r", self._address, problem or "none: it is read")
         self._problem = problem
@@ -166,7 +166,7 @@ class ReceiverSource:
 
 
 def why_unplaced(seen: Message | None) -> str:
-    """Why the newest fix of a receiver is no place, in a sentence; empty where it is one."""
+    """Why a receiver's newest fix is no position, or ""."""
     if not seen:
         return "it sends no positions: switch on GGA and RMC, or NAV-PVT"
     if not seen.values:

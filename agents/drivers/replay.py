@@ -1,18 +1,15 @@
-"""Replay of a log folder, in real time, faster, or as fast as the agent is."""
+"""Replay of a log folder: real time, faster, or as fast as the agent."""
 
 from collections.abc import Callable, Mapping, Sequence
 
 from protocol.machine.log_folder import LogFolder
 from protocol.machine.readings import Reading
 
-SPAN_NS = 50_000_000  # readings of 50 ms are handed on together, as a live bundle does
+SPAN_NS = 50_000_000  # readings of 50 ms together, like a live bundle
 
 
 class Replay:
-    """Driver that reads a log folder.
-
-    speed: times real time; 0 is as fast as possible. clock, wait: seconds that pass, and how to let them pass.
-    """
+    """Reads a log folder. speed: times real time; 0 for unlimited. clock, wait: time [s] and pause."""
 
     def __init__(
         self, log: LogFolder, speed: float, clock: Callable[[], float], wait: Callable[[float], object]
@@ -27,7 +24,7 @@ class Replay:
         self._began_s = clock()
 
     def read(self, timeout_s: float) -> Sequence[Reading] | None:
-        """Readings of the next 50 ms of the log, once they are due."""
+        """The next 50 ms of the log, once due."""
         if self._next is None:
             return None
         if self._speed > 0:
@@ -39,15 +36,15 @@ class Replay:
         return self._next_span(self._next[0] + SPAN_NS)
 
     def counters(self) -> Mapping[str, int]:
-        """Rows of the log that were refused, by reason."""
+        """Refused rows of the log, by reason."""
         return {f"log_{reason}": n for reason, n in self._log.refused.items()}
 
     def problems(self) -> Sequence[str]:
-        """None: a file is there or is not."""
+        """None."""
         return ()
 
     def close(self) -> None:
-        """Nothing is held open between two reads."""
+        """Do nothing: nothing stays open between reads."""
 
     def _next_span(self, end_ns: int) -> list[Reading]:
         span: list[Reading] = []

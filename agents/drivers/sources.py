@@ -1,6 +1,6 @@
-"""All [[driver]] tables of an agent as one driver: a thread reads each, one time base makes readings of their values.
+"""All [[driver]] tables as one driver: a thread each, and one time base that turns values into readings.
 
-Values wait until a receiver has stated UTC: without one there is no position either, and so no sample.
+Values wait until a receiver states UTC; before that there is no position either.
 """
 
 import logging
@@ -19,14 +19,14 @@ from protocol.machine.readings import Reading, parse_reading
 
 log = logging.getLogger("agents.drivers")
 
-QUEUE = 2000  # pieces of some values each that wait for the agent: 10 s and more
-UNTIED = 60_000  # values that wait for UTC: ten minutes at 100 Hz, then the oldest are dropped and counted
+QUEUE = 2000  # capacity in pieces: 10 s or more
+UNTIED = 60_000  # capacity of values waiting for UTC: ten minutes at 100 Hz; older ones are dropped and counted
 POLL_S = 0.2
-GATHER_S = 0.05  # values of so long are handed on together, as in a bundle: each time costs a change of threads
+GATHER_S = 0.05  # values of this time travel together: each piece costs a thread switch
 
 
 class Sources:
-    """Driver of several sources, by name."""
+    """Driver of several named sources."""
 
     def __init__(self, sources: Mapping[str, Source], time_base: TimeBase) -> None:
         self._sources, self._time_base = dict(sources), time_base
@@ -41,11 +41,11 @@ class Sources:
             thread.start()
 
     def receivers(self) -> dict[str, ReceiverSource]:
-        """Those that read a port of a receiver, by address."""
+        """Receiver ports, by address."""
         return {name: source for name, source in self._sources.items() if isinstance(source, ReceiverSource)}
 
     def read(self, timeout_s: float) -> Sequence[Reading] | None:
-        """Readings of the next piece, and of all before it that waited for UTC."""
+        """Readings of the next piece, and of earlier values that waited for UTC."""
         try:
             name, observed = self._queue.get(timeout=timeout_s if self._running else 0.0)
         except queue.Empty:
@@ -56,12 +56,12 @@ class Sources:
         return [reading for value in observed for reading in self._readings(name, value)]
 
     def counters(self) -> Mapping[str, int]:
-        """What each source counts, behind its name, and what was refused here."""
+        """Counters of each source by its name, and refusals here."""
         of_sources = {f"{name} {n}": v for name, source in self._sources.items() for n, v in source.counters().items()}
         return {**of_sources, **self._time_base.counters, **self._counters}
 
     def problems(self) -> Sequence[str]:
-        """What hinders each source, and that readings wait for UTC."""
+        """Problems of the sources, and readings waiting for UTC."""
         problems = [*self._failed, *(problem for source in self._sources.values() for problem in source.problems())]
         for name, ahead_s in self._time_base.apart_s.items():
             where = "ahead of" if ahead_s > 0 else "behind"
@@ -71,7 +71,7 @@ class Sources:
         return problems
 
     def close(self) -> None:
-        """End the threads, then the sources."""
+        """End the threads and sources."""
         self._stop.set()
         for thread in self._threads:
             thread.join()
@@ -79,7 +79,7 @@ class Sources:
     def _run(self, name: str, source: Source) -> None:
         try:
             self._gather(name, source)
-        except Exception as error:  # of a plug-in: the others go on
+        except Exception as error:  # of a plug-in
             log.exception("a driver ended")
             self._failed.append(f"{name}: its driver ended ({error!r}): mend it, and start the agent again")
         source.close()
@@ -98,14 +98,14 @@ class Sources:
         self._put(name, gathered)
 
     def _put(self, name: str, observed: Sequence[Observed] | None) -> None:
-        """Hand on; while the agent is busy, bytes wait in the port or file."""
+        """Queue; while the agent is busy, bytes wait in port or file."""
         while not self._stop.is_set():
             with suppress(queue.Full):
                 self._queue.put((name, observed), timeout=POLL_S)
                 return
 
     def _readings(self, clock: str, value: Observed) -> list[Reading]:
-        """Readings of a value, and of those that waited for the time that it states."""
+        """Readings of a value and of those that waited."""
         if not value.sensor:
             self._time_base.take(clock, value.utc_ns, value.host_ns)
         if self._time_base.utc_ns(value.host_ns) is None:

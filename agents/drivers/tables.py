@@ -1,4 +1,4 @@
-"""[[driver]] tables of agent.toml: what talks on which port, and which sensor each of its streams feeds."""
+"""[[driver]] tables of agent.toml: what talks on which port, and which sensors its streams feed."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,20 +20,19 @@ from agents.drivers.zenoh import ZENOH, BundleSource
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import QUANTITIES, MachineConfig, SensorConfig
 
-CAN = "can"  # kind of a machine's own bus
+CAN = "can"  # a machine's own bus
 PLUG_INS = "sitegrid.drivers"  # group of entry points
 
 
 @dataclass(frozen=True)
 class DriverConfig:
-    """One [[driver]]: a port that is listened to.
+    """One [[driver]]: a port to listen to.
 
-    kind: `nmea`, `ubx`, `gpsd`, `can`, `zenoh`, or the name of a plug-in. address: a serial port (`/dev/ttyACM0`),
-    `tcp://HOST:PORT`, `udp://[HOST]:PORT`, or a file of recorded bytes; of `zenoh` none; of `can` as `split_bus` has
-    it. baud: of a serial port; 0 finds it. feeds: the sensor that takes each stream, one of STREAMS; `gp:fix` is that
-    of one NMEA talker, gpsd device, or address on a bus (`0x0f:retarder`) among several; of `zenoh` a stream is a
-    sensor's name in the bundles. dbc, signals: of `can`, signals beside the built-in ones, and a file that describes
-    them. options: of a plug-in.
+    kind: `nmea`, `ubx`, `gpsd`, `can`, `zenoh`, or a plug-in. address: a serial port (`/dev/ttyACM0`),
+    `tcp://HOST:PORT`, `udp://[HOST]:PORT`, or a recorded file; none for `zenoh`; for `can` see `split_bus`. baud: 0
+    finds it. feeds: sensor by stream, of STREAMS; `gp:fix` names an NMEA talker, gpsd device, or bus address
+    (`0x0f:retarder`); for `zenoh` a sensor in the bundles. dbc, signals: of `can`: a file of signals, and others beside
+    the built-in ones. options: of a plug-in.
     """
 
     kind: str
@@ -89,26 +88,26 @@ class DriverConfig:
 
     @property
     def states_utc(self) -> bool:
-        """Whether what it reads states UTC: receivers do, and recordings of a bus."""
+        """Whether it states UTC, as receivers and bus recordings do."""
         return self.kind in DECODERS or (self.kind == CAN and is_recording(self.address))
 
     @property
     def name(self) -> str:
-        """Its address, or its kind where it has none."""
+        """Address, else kind."""
         return self.address or self.kind
 
 
-# Of a plug-in: makes the source of a table; raises ValueError where the table is wrong.
+# Of a plug-in: makes a table's source; ValueError for a wrong table.
 Factory = Callable[[DriverConfig, MachineConfig], Source]
 
 
 def known_kinds() -> list[str]:
-    """Ours, then plug-ins that are installed."""
+    """Built-in kinds, then installed plug-ins."""
     return [*DECODERS, CAN, ZENOH, *(plug_in.name for plug_in in entry_points(group=PLUG_INS))]
 
 
 def check_drivers(drivers: Sequence[DriverConfig], machine: MachineConfig, where: str) -> None:
-    """Refuse tables that do not fit each other or the machine; raises ConfigError."""
+    """Refuse tables that contradict each other or the machine; ConfigError."""
     addresses = [driver.name for driver in drivers]
     fed = [name for driver in drivers for name in driver.feeds.values()]
     for names, what in ((addresses, "two listen at"), (fed, "two streams feed")):
@@ -123,7 +122,6 @@ def check_drivers(drivers: Sequence[DriverConfig], machine: MachineConfig, where
 
 
 def _misfit(driver: DriverConfig, stream: str, sensor: SensorConfig) -> str:
-    """Why a stream cannot feed a sensor; empty where it can."""
     if driver.kind == CAN:
         return misfit(stream, sensor, driver.signals)
     if driver.kind not in DECODERS:
@@ -144,10 +142,9 @@ def open_sources(
     host_utc: Callable[[], tuple[int, int]],
     bundles: Callable[[], Driver],
 ) -> Sources:
-    """Begin to listen.
+    """Start to listen.
 
-    host_utc: the host's UTC and monotonic clock [ns], where no receiver states the time. bundles: listens to the
-    machine's key `sensors`.
+    host_utc: the host's UTC and monotonic clock [ns], without receivers. bundles: driver of the key `sensors`.
     """
     time_base = TimeBase()
     if not any(driver.states_utc for driver in drivers):

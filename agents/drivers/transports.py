@@ -1,4 +1,4 @@
-"""Where bytes come from: serial ports, TCP, UDP, files. A link that breaks raises OSError; its owner opens it again."""
+"""Byte links: serial ports, TCP, UDP, files. A broken link raises OSError; its owner reopens it."""
 
 import errno
 import os
@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-MOST_BYTES = 1 << 16  # of a datagram, which is read whole or cut
-TOGETHER_S = 0.02  # bytes of so long are read at once: to wake up costs more than a frame; times are the senders' own
-CONNECT_S = 1.0  # a machine's own network answers in milliseconds
-WRITE_S = 1.0  # for a piece of what is sent, at any baud
-BITS = 10  # of a byte on a serial line: start, eight, stop
-WIRED = re.compile(r"/tty(?!ACM)[A-Z]")  # ports whose bytes go over a wire at their baud; ttyACM is USB alone
-# Why a link cannot be opened, and what to do.
+MOST_BYTES = 1 << 16  # per read; longer datagrams are cut
+TOGETHER_S = 0.02  # bytes gathered per read: waking up costs more than a frame
+CONNECT_S = 1.0  # timeout; own networks answer in milliseconds
+WRITE_S = 1.0  # timeout of one write, at any baud
+BITS = 10  # per byte on a serial line: start, eight, stop
+WIRED = re.compile(r"/tty(?!ACM)[A-Z]")  # ports with real baud; ttyACM is USB only
+# Why a link cannot be opened, and the remedy.
 WHY = {
     errno.EACCES: "no permission: add this user to the group of the port (dialout), and log in again",
     errno.EAGAIN: "another program has this port: end it (gpsd, ModemManager?)",
@@ -27,14 +27,14 @@ SAME = {errno.EPERM: errno.EACCES, errno.EBUSY: errno.EAGAIN, errno.EADDRINUSE: 
 
 
 class Transport:
-    """An open link. is_live: bytes come when they are sent; a file has them all. byte_ns: how long a byte takes."""
+    """An open link. is_live: bytes come as sent, unlike a file's. byte_ns: duration of a byte."""
 
     def __init__(self, link: Any, *, is_live: bool = True, byte_ns: float = 0.0) -> None:
-        """link: with `fileno` and `close`."""
+        """Wrap a `link` with `fileno` and `close`."""
         self._link, self.is_live, self.byte_ns = link, is_live, byte_ns
 
     def read(self, timeout_s: float) -> bytes | None:
-        """Bytes that have come in, empty if none came, None at the end of a file; OSError where the link broke."""
+        """New bytes, maybe none; None at the end of a file. OSError if the link broke."""
         if self.is_live:
             if not select.select([self._link.fileno()], [], [], timeout_s)[0]:
                 return b""
@@ -46,7 +46,7 @@ class Transport:
         return None
 
     def write(self, data: bytes) -> None:
-        """Send all bytes to the receiver; OSError where that is not possible, or takes too long."""
+        """Send all bytes; OSError if impossible or too slow."""
         left = memoryview(data)
         while left:
             if not select.select([], [self._link.fileno()], [], WRITE_S)[1]:
@@ -54,12 +54,12 @@ class Transport:
             left = left[os.write(self._link.fileno(), left) :]
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close it."""
         self._link.close()
 
 
 def open_transport(address: str, baud: int) -> Transport:
-    """Open `tcp://HOST:PORT`, `udp://[HOST]:PORT`, a file, or a serial port; OSError where that fails."""
+    """Open `tcp://HOST:PORT`, `udp://[HOST]:PORT`, a file, or a serial port; OSError."""
     if "://" in address:
         scheme, host, port = split_address(address)
         return Transport(socket.create_connection((host, port), CONNECT_S) if scheme == "tcp" else _bound(host, port))
@@ -75,7 +75,7 @@ def open_transport(address: str, baud: int) -> Transport:
 
 
 def split_address(address: str) -> tuple[str, str, int]:
-    """Scheme, host and port; ValueError where it is no address."""
+    """Scheme, host, port; ValueError if it is no address."""
     parts = urlsplit(address)
     if parts.scheme not in ("tcp", "udp") or not parts.port or (parts.scheme == "tcp" and not parts.hostname):
         raise ValueError(f"address: {address!r} is neither tcp://HOST:PORT nor udp://[HOST]:PORT, nor a port or a file")
@@ -83,7 +83,7 @@ def split_address(address: str) -> tuple[str, str, int]:
 
 
 def why_closed(error: OSError) -> str:
-    """Why a link cannot be opened and what to do, in one sentence."""
+    """Why a link cannot be opened, and the remedy, in a sentence."""
     if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
         there = serial_ports()
         return f"no such port; there {'are ' + ', '.join(there) if there else 'is none: plug it in'}"
@@ -94,7 +94,7 @@ def why_closed(error: OSError) -> str:
 
 
 def serial_ports(devices: Path = Path("/dev")) -> list[str]:
-    """Serial ports of this host, by the names that survive replugging where they have one."""
+    """Serial ports, by names that survive replugging where possible."""
     named = sorted((devices / "serial" / "by-id").glob("*"))
     plain = [port for name in ("ttyACM*", "ttyUSB*", "ttyAMA*") for port in sorted(devices.glob(name))]
     known = {port.resolve() for port in named}
@@ -102,7 +102,6 @@ def serial_ports(devices: Path = Path("/dev")) -> list[str]:
 
 
 def _bound(host: str, port: int) -> socket.socket:
-    """A socket for datagrams of whoever sends them here."""
     family, *_, place = socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
     bound = socket.socket(family, socket.SOCK_DGRAM)
     bound.bind(place)

@@ -1,4 +1,4 @@
-"""Readings over Zenoh: bundles of a simulated machine or a remote driver, alone or beside receivers."""
+"""Readings over Zenoh: bundles of a simulated machine or remote driver, alone or with receivers."""
 
 import queue
 import time
@@ -14,12 +14,12 @@ from protocol.machine.readings import Reading, columns
 from protocol.wire import keys
 from protocol.wire.codec import decode_bundle
 
-ZENOH = "zenoh"  # kind of a [[driver]] table
-QUEUE_BUNDLES = 4000  # 200 s of bundles; beyond it bundles are dropped and counted
+ZENOH = "zenoh"
+QUEUE_BUNDLES = 4000  # capacity: 200 s of bundles; further ones are dropped and counted
 
 
 class ZenohDriver:
-    """Driver that subscribes to the machine's `sensors` key; the callback only moves bytes to a queue."""
+    """Subscribes to the machine's `sensors` key; the callback only queues bytes."""
 
     def __init__(self, session: zenoh.Session, site: str, machine: str) -> None:
         self._machine = machine
@@ -39,11 +39,11 @@ class ZenohDriver:
             return ()
 
     def counters(self) -> Mapping[str, int]:
-        """Bundles that were lost or refused, and readings that were refused, by reason."""
+        """Lost or refused bundles, and refused readings, by reason."""
         return dict(self._counters)
 
     def problems(self) -> Sequence[str]:
-        """None: who publishes is not known."""
+        """None: publishers are unknown."""
         return ()
 
     def close(self) -> None:
@@ -72,17 +72,14 @@ class ZenohDriver:
         return bundle.readings
 
     def _count_gap(self, counter: int) -> None:
-        """Count missing bundles; a counter of 1 is a stream that starts anew."""
+        """Count missing bundles; a counter of 1 starts a new stream."""
         if counter > self._newest + 1 and self._newest:
             self._counters["bundles_missing"] += counter - self._newest - 1
         self._newest = counter
 
 
 class BundleSource:
-    """Source of what no receiver carries: readings of these sensors in bundles. feeds: the sensor of each name there.
-
-    Their stamps are UTC, and are believed as those of receivers are.
-    """
+    """Source of readings in bundles, with stamps in UTC. feeds: sensor by its name there."""
 
     def __init__(
         self, bundles: Driver, feeds: Mapping[str, SensorConfig], clock_ns: Callable[[], int] = time.monotonic_ns
@@ -96,11 +93,11 @@ class BundleSource:
         return None if readings is None else [value for reading in readings if (value := self._observed(reading))]
 
     def counters(self) -> Mapping[str, int]:
-        """Those of bundles, and readings of another kind than the sensor's."""
+        """Those of bundles, and readings of a wrong kind."""
         return {**self._bundles.counters(), **dict(self._counters)}
 
     def problems(self) -> Sequence[str]:
-        """None: who publishes is not known."""
+        """None: publishers are unknown."""
         return ()
 
     def close(self) -> None:

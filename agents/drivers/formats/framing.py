@@ -1,8 +1,7 @@
-"""Bytes into frames: finds its way again after broken bytes, and loses no whole frame among broken ones.
+"""Bytes to frames: resynchronises after broken bytes, and loses no whole frame.
 
-A frame that seems to begin is a candidate until its end has come: what begins inside of it is a candidate too, and is
-judged by its own checksum alone. So neither a spoiled length nor a checksum that fits by chance hides a whole frame,
-which is out as soon as its last byte is in.
+Each possible start is a candidate until its end arrives, judged by its own checksum. So neither a corrupt length nor an
+accidental checksum hides a whole frame, which is out with its last byte.
 """
 
 import json
@@ -16,7 +15,7 @@ UBX, NMEA, GPSD = "ubx", "nmea", "gpsd"
 
 
 class Frame(NamedTuple):
-    """A whole frame. format: by name. after: how many bytes of the same piece came after its end."""
+    """A whole frame. after: bytes of the same piece behind it."""
 
     format: str
     data: bytes
@@ -25,10 +24,10 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True)
 class Framing:
-    """How a format tells frames from other bytes.
+    """How a format marks frames.
 
-    sync: how a frame begins. most: bytes of the longest frame. end: where a frame that begins at an index ends, beyond
-    the buffer while that is not known, None where no frame is there. is_whole: whether its checksum is right.
+    sync: begin of a frame. most: longest frame [bytes]. end: end of a frame beginning at an index, beyond the buffer
+    while unknown, None for no frame. is_whole: checksum test.
     """
 
     sync: bytes
@@ -38,9 +37,9 @@ class Framing:
 
 
 class Framer:
-    """Cuts a stream of bytes into frames of some formats, whose first bytes differ.
+    """Cuts bytes into frames of formats with distinct first bytes.
 
-    between: bytes that may stand between frames. broken: how many others belong to none.
+    between: bytes allowed between frames. broken: count of others in no frame.
     """
 
     def __init__(self, framings: Mapping[str, Framing], between: bytes = b"\r\n") -> None:
@@ -52,12 +51,12 @@ class Framer:
         self._cut_sync, self._longest = re.compile(b"(?:" + cut + rb")\Z"), max(map(len, syncs))
         self._between = between
         self._buffer = bytearray()
-        self._open: list[int] = []  # candidates whose end has not come
-        self._read: list[tuple[int, int]] = []  # whole frames whose bytes an open candidate still needs
-        self._searched = 0  # up to where candidates are known
+        self._open: list[int] = []  # candidates without their end
+        self._read: list[tuple[int, int]] = []  # whole frames still needed by a candidate
+        self._searched = 0  # end of the search for candidates
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that these bytes make whole, by their ends."""
+        """Frames completed by these bytes, by their ends."""
         buffer, frames = self._buffer, list[Frame]()
         buffer += data
         candidates = [*self._open, *(match.start() for match in self._sync.finditer(buffer, self._searched))]
@@ -78,7 +77,7 @@ class Framer:
         return frames
 
     def _forget(self) -> None:
-        """Drop the bytes that no candidate needs, nor a sync that is cut; count those that were in no frame."""
+        """Drop bytes that no candidate or cut sync needs; count broken ones."""
         buffer = self._buffer
         cut = self._cut_sync.search(buffer, max(0, len(buffer) - self._longest))
         searched = cut.start() if cut else len(buffer)
@@ -100,19 +99,18 @@ class Framer:
 
 
 def _ubx_end(buffer: bytes | bytearray, start: int) -> int | None:
-    """Two bytes of sync, class, identity, length, payload, two of checksum."""
+    """Sync (2), class, identity, length (2), payload, checksum (2)."""
     if len(buffer) < start + 6:
         return start + 8
     return start + 8 + int.from_bytes(buffer[start + 4 : start + 6], "little")
 
 
 def _ubx_is_whole(frame: bytes) -> bool:
-    """Fletcher's checksum."""
     counted = frame[2:-2]
     return sum(counted) & 255 == frame[-2] and sum(accumulate(counted)) & 255 == frame[-1]
 
 
-_NMEA_END = re.compile(rb"[^ -#%-)+-~]")  # the star before the checksum, or what no sentence holds
+_NMEA_END = re.compile(rb"[^ -#%-)+-~]")  # the star before the checksum, or a character foreign to sentences
 
 
 def _nmea_end(buffer: bytes | bytearray, start: int) -> int | None:
@@ -123,7 +121,7 @@ def _nmea_end(buffer: bytes | bytearray, start: int) -> int | None:
 
 
 def _nmea_is_whole(frame: bytes) -> bool:
-    """All between dollar and star, by exclusive or."""
+    """Exclusive or between dollar and star."""
     checksum = 0
     for byte in frame[1:-3]:
         checksum ^= byte
@@ -144,6 +142,6 @@ def _gpsd_is_whole(frame: bytes) -> bool:
 
 FRAMINGS = {
     UBX: Framing(b"\xb5b", 4096, _ubx_end, _ubx_is_whole),  # RXM-RAWX of 100 signals has 3.2 kB
-    NMEA: Framing(b"$", 255, _nmea_end, _nmea_is_whole),  # 82 by the standard, more where receivers are precise
+    NMEA: Framing(b"$", 255, _nmea_end, _nmea_is_whole),  # 82 by the standard; precise receivers send more
     GPSD: Framing(b'{"class":', 10_240, _gpsd_end, _gpsd_is_whole),  # gpsd's own limit
 }

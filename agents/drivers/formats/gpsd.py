@@ -1,7 +1,6 @@
-"""gpsd's reports, JSON objects in lines, into messages. Pure.
+"""Reports of gpsd, JSON objects in lines, to messages. Pure.
 
-Its error estimates (`epx`, `epy`, `eph`, `eps`) are no standard deviations: they are left out, and a sensor that it
-feeds states its own (`std`).
+Its error estimates (`epx`, `epy`, `eph`, `eps`) are no standard deviations; a fed sensor states its own (`std`).
 """
 
 import json
@@ -13,28 +12,28 @@ from typing import Any
 from agents.drivers import formats
 from agents.drivers.formats import Message
 
-GPSD_PORT = 2947  # where it listens
-GREETING = b'?WATCH={"enable":true,"json":true};\n'  # asks for reports
+GPSD_PORT = 2947  # default port
+GREETING = b'?WATCH={"enable":true,"json":true};\n'  # requests reports
 QUALITIES = {1: "autonomous", 2: "differential", 3: "fixed", 4: "float"}  # by `status`
-PLANE, SPACE = 2, 3  # `mode` of a fix in two and three dimensions
+PLANE, SPACE = 2, 3  # `mode` of 2-D and 3-D fixes
 
 
 class GpsdDecoder:
-    """Decodes the reports of one gpsd. devices: those that are receivers of their own; all others are one together."""
+    """Decodes one gpsd's reports. devices: receivers of their own; all others count as one."""
 
     def __init__(self, devices: Collection[str] = ()) -> None:
         self._devices = frozenset(devices)
         self._satellites = 0
 
     def decode(self, frame: bytes, _: int) -> Sequence[Message]:
-        """Messages of a report; none of a class that is not used."""
+        """Messages of a report; none of unused classes."""
         report = json.loads(frame)
         if report["class"] == "SKY":
             self._satellites = int(_number(report, "uSat", self._satellites))
         return self._fix(report) if report["class"] == "TPV" else ()
 
     def _fix(self, report: dict[str, Any]) -> Sequence[Message]:
-        """Time, position and velocity."""
+        """Time, position, velocity."""
         device = report.get("device")
         source = device.lower() if isinstance(device, str) and device.lower() in self._devices else ""
         if report.get("mode") not in (PLANE, SPACE) or "time" not in report:

@@ -1,7 +1,7 @@
-"""NMEA 0183: sentences of receivers into messages. Pure.
+"""NMEA 0183 sentences to messages. Pure.
 
-A sentence has a time without date, or none. The date is RMC's or ZDA's; midnight may lie between the two. What has no
-time belongs to the epoch whose sentences surround it.
+Sentences have a time without date, or none. RMC and ZDA give the date; midnight may lie between. Untimed sentences
+belong to the surrounding epoch.
 """
 
 import math
@@ -13,22 +13,22 @@ from agents.drivers.formats import Message
 from protocol.units import DAY_NS, ddmm_deg, factor
 
 SENTENCES = frozenset(("RMC", "ZDA", "GGA", "GST", "VTG", "HDT", "THS"))  # a method of the receiver each
-# By GGA's quality: its name, and the error of a range [m], which HDOP turns into a position's where no GST states it.
+# GGA's quality: name, and range error [m], which HDOP scales to position without GST.
 QUALITIES = {1: ("autonomous", 3.0), 2: ("differential", 1.5), 4: ("fixed", 0.02), 5: ("float", 0.3)}
 KNOT_MPS = factor("kn", "speed_mps")
-SPEED_STD_MPS = 0.1  # of a Doppler velocity: NMEA states none
-HEADING_STD_RAD = math.radians(0.5)  # of two antennas a metre apart: NMEA states none
-SAME_EPOCH = 0.75  # share of the time between epochs within which an untimed sentence belongs to the last one
+SPEED_STD_MPS = 0.1  # of Doppler velocity; NMEA states none
+HEADING_STD_RAD = math.radians(0.5)  # of two antennas a metre apart; NMEA states none
+SAME_EPOCH = 0.75  # share of the epoch interval within which an untimed sentence belongs to the last epoch
 
 
 class NmeaDecoder:
-    """Decodes the sentences of one line. talkers: receivers of their own; all others are one receiver together."""
+    """Decodes one line's sentences. talkers: receivers of their own; all others count as one."""
 
     def __init__(self, talkers: Collection[str] = ()) -> None:
         self._receivers = {talker: _Receiver(talker) for talker in ("", *talkers)}
 
     def decode(self, frame: bytes, host_ns: int) -> Sequence[Message]:
-        """Messages of a sentence whose checksum is right; none of a kind that is not used."""
+        """Messages of a checked sentence; none of unused kinds."""
         address, *words = frame[1:-3].decode("ascii").split(",")
         if len(address) != 5 or (sentence := address[2:]) not in SENTENCES:
             return ()
@@ -38,19 +38,19 @@ class NmeaDecoder:
 
 
 class _Receiver:
-    """What the sentences of one receiver say of each other."""
+    """State between one receiver's sentences."""
 
     def __init__(self, source: str) -> None:
         self._source = source
-        self._utc_ns = 0  # of the newest epoch, 0 while the date is not known
-        self._arrived_ns = 0  # its first sentence
+        self._utc_ns = 0  # of the newest epoch, 0 without date
+        self._arrived_ns = 0  # of its first sentence
         self._period_ns = 10**9  # between epochs
         self._quality = 0
-        self._std_m: tuple[float, float, float] | None = None  # as GST said last
+        self._std_m: tuple[float, float, float] | None = None  # by the last GST
         self._states_velocity = False  # by RMC, which has its time
 
     def rmc(self, words: list[str], host_ns: int) -> Sequence[Message]:
-        """Time, date, speed and course."""
+        """Time, date, speed, course."""
         time, status, _, _, _, _, speed, course, date = _first(words, 9)
         if status != "A" or not (time and date):
             return ()
@@ -59,14 +59,14 @@ class _Receiver:
         return *begun, *self._velocity(self._utc_ns, speed, course)
 
     def zda(self, words: list[str], host_ns: int) -> Sequence[Message]:
-        """Time and date, which count once there is a fix: a receiver without one may guess."""
+        """Time and date, once there is a fix: before, receivers may guess."""
         time, day, month, year = _first(words, 4)
         if self._quality and time and day and month and year:
             return self._begin_epoch(_utc_ns(time, year, month, day), host_ns)
         return ()
 
     def gga(self, words: list[str], host_ns: int) -> Sequence[Message]:
-        """Place and quality."""
+        """Position and quality."""
         time, lat, north, lon, east, quality, satellites, hdop, height, _, separation = _first(words, 11)
         before, self._quality = self._quality, int(quality or 0)
         count = int(satellites or 0)
@@ -84,13 +84,13 @@ class _Receiver:
         return *begun, Message(formats.FIX, self._source, self._utc_ns, values, quality=name, satellites=count)
 
     def gst(self, words: list[str], _: int) -> Sequence[Message]:
-        """Standard deviations of the fixes around it; a receiver that states 0 does not know them."""
+        """Standard deviations of fixes; 0 means unknown."""
         north_m, east_m, up_m = (float(word or 0) for word in _first(words, 8)[5:])
         self._std_m = (east_m, north_m, up_m) if min(north_m, east_m, up_m) > 0 else None
         return ()
 
     def vtg(self, words: list[str], host_ns: int) -> Sequence[Message]:
-        """Speed and course, of a receiver that sends no RMC."""
+        """Speed and course, without RMC."""
         course, _, _, _, knots, _, _, _ = _first(words, 8)
         is_valid = self._quality and (len(words) < 9 or words[8] != "N")
         return (
@@ -102,7 +102,7 @@ class _Receiver:
         return self.ths([*words[:1], "A"], host_ns)
 
     def ths(self, words: list[str], host_ns: int) -> Sequence[Message]:
-        """The same with a mode: autonomous, or else estimated, simulated, not valid."""
+        """The same with a mode; only autonomous counts."""
         degrees, mode = _first(words, 2)
         if mode != "A" or not degrees:
             return ()
@@ -110,7 +110,7 @@ class _Receiver:
         return (Message(formats.HEADING, self._source, self._untimed_ns(host_ns), values),)
 
     def _velocity(self, utc_ns: int, knots: str, course: str) -> Sequence[Message]:
-        """A receiver that is slow states no course: then its speed is how far its velocity is off zero."""
+        """Slow receivers state no course: then the speed is an error around zero."""
         if not knots:
             return ()
         speed_mps = float(knots) * KNOT_MPS
@@ -120,11 +120,11 @@ class _Receiver:
         return (Message(formats.VELOCITY, self._source, utc_ns, values),)
 
     def _dated_ns(self, time_ns: int) -> int:
-        """A time of day with the date that brings it nearest to the last epoch; 0 while no date is known."""
+        """Time of day with the date nearest to the last epoch; 0 without date."""
         return self._utc_ns and self._utc_ns + formats.wrapped(time_ns - self._utc_ns % DAY_NS, DAY_NS)
 
     def _begin_epoch(self, utc_ns: int, host_ns: int) -> Sequence[Message]:
-        """Note the time of a sentence; a message of the time itself if it is the first of its epoch."""
+        """Note a sentence's time; a time message for the first of an epoch."""
         if utc_ns == self._utc_ns:
             return ()
         if 0 < utc_ns - self._utc_ns <= 2 * 10**9:
@@ -133,7 +133,7 @@ class _Receiver:
         return (Message(formats.TIME, self._source, utc_ns),)
 
     def _untimed_ns(self, host_ns: int) -> int:
-        """The epoch of a sentence without time: the last one, or the next one shortly before it is due."""
+        """Epoch of an untimed sentence: the last, or the next if almost due."""
         is_next = host_ns - self._arrived_ns > SAME_EPOCH * self._period_ns
         return self._utc_ns and self._utc_ns + (self._period_ns if is_next else 0)
 
@@ -145,7 +145,7 @@ def _first(words: list[str], n: int) -> list[str]:
 
 
 def _time_of_day_ns(text: str) -> int:
-    """Nanoseconds since midnight of hhmmss.sss; second 60 is a leap second, which counts as the next minute's first."""
+    """Nanoseconds since midnight of hhmmss.sss; a leap second (60) counts as the next minute."""
     hours, minutes, seconds = int(text[:2]), int(text[2:4]), float(text[4:])
     if not (0 <= hours < 24 and 0 <= minutes < 60 and 0 <= seconds < 61):
         raise ValueError(f"{text!r} is no time")
@@ -153,7 +153,7 @@ def _time_of_day_ns(text: str) -> int:
 
 
 def _utc_ns(time: str, year: str, month: str, day: str) -> int:
-    """UTC of time and date; a year of two digits is of 1980 to 2079."""
+    """UTC of time and date; two-digit years mean 1980 to 2079."""
     full = int(year) if len(year) > 2 else (int(year) - 80) % 100 + 1980
     midnight = datetime(full, int(month), int(day), tzinfo=UTC)
     return formats.rolled_over(round(midnight.timestamp()) * 10**9 + _time_of_day_ns(time))

@@ -1,7 +1,7 @@
-"""u-blox's UBX: frames into messages. Pure. Offsets, scales and flags are those of the interface descriptions M8 to F9.
+"""UBX frames of u-blox to messages. Pure. Offsets, scales and flags: interface descriptions M8 to F9.
 
-NAV-PVT has a fix, its accuracies and its Doppler velocity; NAV-RELPOSNED the heading of two antennas; ESF-MEAS and
-ESF-RAW have the IMU inside the receiver and wheel ticks, by the sensors' own clock.
+NAV-PVT: fix, accuracies, Doppler velocity. NAV-RELPOSNED: heading of two antennas. ESF-MEAS, ESF-RAW: internal IMU and
+wheel ticks, by sensor clocks.
 """
 
 import math
@@ -16,31 +16,31 @@ from agents.drivers.formats import Message
 PVT = Struct("<IH6BIi2BxB4i2I2i12xI6xH")
 RELPOSNED = Struct("<B3xI16xi24xI4xI")
 MEAS, RAW = Struct("<IHH"), Struct("<II")
-BY_SATELLITES = (2, 3, 4)  # fix types with a place: in two and three dimensions, and held up by the receiver's sensors
+BY_SATELLITES = (2, 3, 4)  # fix types with a position: 2-D, 3-D, and with the receiver's sensors
 CARRIER = ("autonomous", "float", "fixed")  # quality by carrier solution
-HEADING_VALID = 1 | 1 << 2 | 1 << 8  # flags of fix, relative position and heading
+HEADING_VALID = 1 | 1 << 2 | 1 << 8  # fix, relative position, heading
 GYROS, FORCES = (14, 13, 5), (16, 17, 18)  # data types of x, y, z
 RAD_PER_LSB, MPS2_PER_LSB = math.radians(2**-12), 2**-10
-AXLES = ((8, 9), (6, 7), (10, 10))  # left and right wheel of the rear axle, of the front one; one sensor for all
-BACKWARD, TICK_RANGE = 1 << 23, 1 << 23  # of a wheel: the flag of reverse; where its counter starts again
-SIGN = 1 << 23  # of a value in 24 bits
-TOGETHER_NS = 20 * 10**6  # between rates and forces of one reading: they come in frames of their own, 5 ms apart
+AXLES = ((8, 9), (6, 7), (10, 10))  # left and right wheel of rear axle, front axle; one sensor for all
+BACKWARD, TICK_RANGE = 1 << 23, 1 << 23  # reverse flag, and counter period
+SIGN = 1 << 23  # of a 24-bit value
+TOGETHER_NS = 20 * 10**6  # of rates and forces in one reading: their frames come 5 ms apart
 
 
 class UbxDecoder:
-    """Decodes the frames of one receiver; a line has but one."""
+    """Decodes one receiver's frames."""
 
     def __init__(self, _: Collection[str] = ()) -> None:
-        self._epoch: tuple[int, int] | None = None  # time of week [ms] of the newest NAV-PVT, and its UTC [ns]
+        self._epoch: tuple[int, int] | None = None  # time of week [ms] of the newest NAV-PVT, and UTC [ns]
         self._measured_clock = _TagClock(10**6, 1 << 32)
-        self._raw_clock = _TagClock(39_062.5, 1 << 24)  # of the IMU in M8 and F9 receivers, a BMI160
+        self._raw_clock = _TagClock(39_062.5, 1 << 24)  # of the BMI160 in M8 and F9 receivers
         self._has_raw = False
         self._takes = {(1, 7): self.pvt, (1, 60): self.relposned, (16, 2): self.measured, (16, 3): self.raw}
-        self._axes: dict[int, tuple[int, float]] = {}  # by data type: tag and value
-        self._wheels: dict[int, tuple[int, int]] = {}  # by data type: what the counter was, and ticks since the start
+        self._axes: dict[int, tuple[int, float]] = {}  # tag and value, by data type
+        self._wheels: dict[int, tuple[int, int]] = {}  # counter, and ticks since the start, by data type
 
     def decode(self, frame: bytes, _: int) -> Sequence[Message]:
-        """Messages of a frame whose checksum is right; none of a kind that is not used."""
+        """Messages of a checked frame; none of unused kinds."""
         take = self._takes.get((frame[2], frame[3]))
         try:
             return take(frame[6:-2]) if take else ()
@@ -48,11 +48,11 @@ class UbxDecoder:
             raise ValueError(str(error)) from None
 
     def pvt(self, payload: bytes) -> Sequence[Message]:
-        """Position, velocity and time."""
+        """Position, velocity, time."""
         fields = PVT.unpack_from(payload)
         week_ms, *date, valid, _, nano, fix_type, flags, satellites = fields[:13]
         lon, lat, height_mm, _, horizontal_mm, vertical_mm, north_mmps, east_mmps, speed_std_mmps, flags3 = fields[13:]
-        utc_ns = _utc_ns(date, nano) if valid & 7 == 7 else 0  # date, time, and leap seconds
+        utc_ns = _utc_ns(date, nano) if valid & 7 == 7 else 0  # date, time, leap seconds
         if utc_ns:
             self._epoch = week_ms, utc_ns
         time = (Message(formats.TIME, "", utc_ns),) if utc_ns else ()
@@ -69,7 +69,7 @@ class UbxDecoder:
         )
 
     def relposned(self, payload: bytes) -> Sequence[Message]:
-        """The direction from the base's antenna to the rover's."""
+        """Direction from the base's antenna to the rover's."""
         version, week_ms, direction, accuracy, flags = RELPOSNED.unpack_from(payload)
         if version != 1 or flags & HEADING_VALID != HEADING_VALID:
             return ()
@@ -79,7 +79,7 @@ class UbxDecoder:
         return (Message(formats.HEADING, "", utc_ns, values),)
 
     def measured(self, payload: bytes) -> Sequence[Message]:
-        """ESF-MEAS: one time for all words, before a word that repeats it."""
+        """ESF-MEAS: one time for all words; a last word may repeat it."""
         tag, flags, _ = MEAS.unpack_from(payload)
         count = flags >> 11 or (len(payload) - MEAS.size) // 4 - (flags >> 3 & 1)
         words = struct.unpack_from(f"<{count}I", payload, MEAS.size)
@@ -88,13 +88,13 @@ class UbxDecoder:
         return [*inertial, *self._ticks(words, tag_ns)]
 
     def raw(self, payload: bytes) -> Sequence[Message]:
-        """ESF-RAW: a time for each word; its IMU is that of ESF-MEAS, at a higher rate."""
+        """ESF-RAW: a time per word; the same IMU at a higher rate."""
         self._has_raw = True
         tagged = RAW.iter_unpack(payload[4:])
         return list(self._inertial((word, self._raw_clock.ns(tag)) for word, tag in tagged))
 
     def _inertial(self, tagged: Iterable[tuple[int, int]]) -> Iterator[Message]:
-        """Readings of all six axes, at the middle of their times."""
+        """Readings of all six axes, at their mean time."""
         axes = self._axes
         for word, tag_ns in tagged:
             axis = word >> 24 & 63
@@ -120,7 +120,7 @@ class UbxDecoder:
         return ()
 
     def _counted(self, wheel: int, word: int) -> int:
-        """Ticks since the start, of a counter that starts again and counts up in reverse too."""
+        """Ticks since the start; the counter wraps, and counts up in reverse too."""
         counter = word & (TICK_RANGE - 1)
         before, total = self._wheels.get(wheel, (counter, 0))
         driven = formats.wrapped(counter - before, TICK_RANGE)
@@ -133,11 +133,11 @@ _SCALES = dict.fromkeys(GYROS, RAD_PER_LSB) | dict.fromkeys(FORCES, MPS2_PER_LSB
 
 
 class _TagClock:
-    """Time by a counter of ticks that starts again. unit_ns: of a tick."""
+    """Time by a wrapping tick counter; unit_ns per tick."""
 
     def __init__(self, unit_ns: float, period: int) -> None:
         self._unit_ns, self._period = unit_ns, period
-        self._ticks = period  # so that what is a little older is no negative time
+        self._ticks = period  # keeps slightly older ticks positive
 
     def ns(self, counter: int) -> int:
         """Nanoseconds from an unknown start."""
@@ -146,7 +146,7 @@ class _TagClock:
 
 
 def _utc_ns(date: Sequence[int], nano: int) -> int:
-    """UTC of year, month, day, hour, minute, second and nanoseconds of either sign; second 60 is a leap second."""
+    """UTC of year to second and signed nanoseconds; second 60 is a leap second."""
     *whole, second = date
     if second > 60 or abs(nano) > 10**9:
         raise ValueError(f"{second} s, {nano} ns are no time")
