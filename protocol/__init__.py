@@ -1,1 +1,1 @@
-"""What machines, map server and clients share: readings, samples, messages, keys, queries, coordinates, errors."""
+"""Shared by machines, map server and clients: readings, samples, messages, keys, queries, coordinates, errors."""

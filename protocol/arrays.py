@@ -1,4 +1,4 @@
-"""Short names for the array types that signatures use."""
+"""Short names for array types."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""TOML files into frozen dataclasses: types checked, unknown keys refused by name, every error with its place."""
+"""TOML to frozen dataclasses: types checked, unknown keys refused, every error located."""
 
 import dataclasses
 import json
@@ -14,10 +14,9 @@ T = TypeVar("T")
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
-    """Build the dataclass `cls` from a TOML table.
+    """Build the dataclass `cls` from a TOML table; ConfigError, also for a ValueError of `__post_init__`.
 
-    `where` is the place that errors name, for example `site.toml [server]`. A `ValueError` from `__post_init__`
-    (a value out of range) becomes a ConfigError at that place.
+    where: place named by errors, such as `site.toml [server]`.
     """
     hints = typing.get_type_hints(cls)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
@@ -35,12 +34,12 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
 
 
 def toml_lines(values: Mapping[str, object]) -> list[str]:
-    """Texts, numbers and lists as lines of TOML, which writes them as JSON does."""
+    """Texts, numbers, lists as TOML, which writes them like JSON."""
     return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items()]
 
 
 def section(table: dict[str, Any], name: str, where: str) -> dict[str, Any]:
-    """Take the sub-table `name` out of `table`, empty where it is absent."""
+    """Take the sub-table `name` out of `table`; empty if absent."""
     return _table(table.pop(name, {}), f"{where} {name}")
 
 
@@ -84,7 +83,7 @@ def _convert_tuple(value: Any, args: tuple[Any, ...], where: str) -> tuple[Any, 
 
 
 def require_between(config: Any, low: float, high: float, *names: str) -> None:
-    """Raise ValueError, by name, on the first of these numbers of a dataclass outside of the limits; None passes."""
+    """ValueError for the first named value outside the limits; None passes."""
     for name in names:
         value = getattr(config, name)
         if value is not None and not low <= value <= high:  # also false for NaN
@@ -92,7 +91,7 @@ def require_between(config: Any, low: float, high: float, *names: str) -> None:
 
 
 def require_positive(config: Any, names: Iterable[str]) -> None:
-    """Raise ValueError, by name, on the first of these numbers of a dataclass that is not positive and finite."""
+    """ValueError for the first named value not positive and finite."""
     for name in names:
         if not 0 < getattr(config, name) < math.inf:  # also false for NaN
             raise ValueError(f"{name}: must be positive and finite")

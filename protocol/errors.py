@@ -1,10 +1,10 @@
-"""The error tree. Each error makes its own one-line message: what is wrong, where, and what to do where that helps."""
+"""The error tree. Each error makes its one-line message: what is wrong, where, and what to do."""
 
 from enum import StrEnum
 
 
 class Refusal(StrEnum):
-    """Why something was refused; the value is also the name of the counter that `info` and health show."""
+    """Why something was refused; also the counter's name in `info` and health."""
 
     TOO_LARGE = "too_large"
     NOT_MSGPACK = "not_msgpack"
@@ -42,7 +42,7 @@ MAX_LINE = 500  # characters
 
 
 def one_line(text: str) -> str:
-    """A text that may hold anything from outside as one line: signs that do not print escaped, its end cut off."""
+    """Foreign text as one line: unprintable characters escaped, its end cut off."""
     if len(text) <= MAX_LINE and text.isprintable():
         return text
     plain = text[:MAX_LINE]
@@ -54,31 +54,31 @@ def one_line(text: str) -> str:
 
 
 class SitegridError(Exception):
-    """Base of all errors that this project raises on purpose. Their texts are one line, whatever they quote."""
+    """Base of this project's errors, each one line whatever it quotes."""
 
     def __init__(self, text: str) -> None:
         super().__init__(one_line(text))
 
 
 class _PlaceError(SitegridError):
-    """Something is wrong at a place: a file or a key in it, a folder, an address."""
+    """A problem at a place: file, key, folder, address."""
 
     def __init__(self, where: object, problem: str) -> None:
         super().__init__(f"{where}: {problem}")
 
 
 class ConfigError(_PlaceError):
-    """A configuration file, or a value in it, is wrong."""
+    """A wrong configuration file or value."""
 
 
 class LogFolderError(_PlaceError):
-    """A log folder or its manifest cannot be read."""
+    """A log folder or manifest cannot be read."""
 
 
 class MessageError(SitegridError):
-    """A message, or one value in it, is refused.
+    """A message, or a value in it, is refused.
 
-    reason: the counter it belongs to. field, row: the place in the message, where there is one (rows count from 0).
+    reason: its counter. field, row: the place, if any (rows from 0).
     """
 
     def __init__(self, reason: Refusal, problem: str, *, field: str | None = None, row: int | None = None) -> None:
@@ -90,7 +90,7 @@ class MessageError(SitegridError):
 
 
 class RowError(SitegridError):
-    """A row of a log is refused. reason: the counter it belongs to."""
+    """A row of a log is refused. reason: its counter."""
 
     def __init__(self, reason: str, problem: str) -> None:
         super().__init__(problem)
@@ -98,7 +98,7 @@ class RowError(SitegridError):
 
 
 class QueryError(SitegridError):
-    """A map query is malformed, or the server refused it. retry_after_s: ask again then, 0 where that is no use."""
+    """A malformed or refused map query. retry_after_s: when to ask again, 0 if never."""
 
     def __init__(self, reason: Refusal | str, problem: str, retry_after_s: float = 0.0) -> None:
         super().__init__(problem)
@@ -111,4 +111,4 @@ class LinkError(_PlaceError):
 
 
 class StoreError(_PlaceError):
-    """A database or snapshot on disk cannot be used."""
+    """An unusable database or snapshot."""

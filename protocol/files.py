@@ -1,4 +1,4 @@
-"""Files: TOML read with errors for people; files that are whole or not there, written beside their place."""
+"""Files: TOML with errors for people, and atomic writes."""
 
 import fcntl
 import os
@@ -17,17 +17,17 @@ PRIVATE = 0o600  # what a site's machines sent is private on a shared host
 
 
 def load_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file; errors name the file and the line."""
+    """Read a TOML file; errors name file and line."""
     return _parse_toml(path, _read_text(path))
 
 
 def sealed(text: str) -> str:
-    """A text behind a line with its checksum: for files that programs write, and flipped bits must not change."""
+    """A text behind its checksum line, against flipped bits in files that programs write."""
     return f"{_seal(text)}\n{text}"
 
 
 def load_sealed_toml(path: Path) -> dict[str, Any]:
-    """As `load_toml`, of a file that was `sealed`; one whose checksum is another is refused."""
+    """As `load_toml`, of a `sealed` file; ConfigError if its checksum differs."""
     first, _, text = _read_text(path).partition("\n")
     if first != _seal(text):
         problem = "is damaged, or was changed by hand; restore it from a backup, or make it anew with `sitegrid keys`"
@@ -53,19 +53,16 @@ def _read_text(path: Path) -> str:
 def _parse_toml(path: Path, text: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text.replace("\r\n", "\n"))
-    except (ValueError, RecursionError) as error:  # also numbers of thousands of digits, and lists as deep
+    except (ValueError, RecursionError) as error:  # also of very long numbers and deep lists
         raise ConfigError(path, f"not valid TOML: {error}") from None
 
 
 @contextmanager
 def whole_file(path: Path, permissions: int = 0o666) -> Iterator[BinaryIO]:
-    """Open a binary file for reading and writing that replaces `path` when the block ends without an error.
+    """Open a binary file that replaces `path` when the block ends without an error; OSError.
 
-    A reader sees the old file or the new one, never half of it, also after a power cut. The file beside it has a name
-    of its own for every writer (`.NAME.*.part`), and is locked while it is written: what a killed writer left is not,
-    and is removed by the next one.
-
-    permissions: of the new file, before the umask. Raises OSError.
+    Readers see the old file or the new one, also after a power cut. Each writer locks its own `.NAME.*.part`; the next
+    one removes unlocked leftovers of killed writers. permissions: of the new file, before the umask.
     """
     for left in path.parent.glob(f".{path.name}.*.part"):
         _remove_if_left(left)
@@ -82,14 +79,14 @@ def whole_file(path: Path, permissions: int = 0o666) -> Iterator[BinaryIO]:
 
 
 def write_whole(path: Path, data: bytes, permissions: int = 0o666) -> None:
-    """Write a file whole or not at all; raises OSError."""
+    """Write a file atomically; OSError."""
     with whole_file(path, permissions) as file:
         file.write(data)
 
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Make a folder that gets its name when the block ends without an error; else nothing is there. Raises OSError."""
+    """Make a folder that appears when the block ends without an error; OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{path.name}.", suffix=".part", dir=path.parent) as beside:
         part = Path(beside) / path.name
@@ -101,12 +98,12 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def make_private(path: Path) -> None:
-    """Make an empty file that only its owner reads, whatever the umask, unless there is one; raises OSError."""
+    """Create a missing file readable only by its owner, whatever the umask; OSError."""
     os.close(os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE))
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable; raises OSError."""
+    """Make a folder's names durable; OSError."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -115,7 +112,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _open_locked(path: Path, permissions: int) -> tuple[Path, BinaryIO]:
-    """Make a file beside `path`; again where another writer took it for a leftover before it was locked."""
+    """Create a file beside `path`; retry if another writer removed it before the lock."""
     while True:
         part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
         file = open(part, "x+b", opener=lambda name, flags: os.open(name, flags, permissions))  # noqa: SIM115
@@ -126,7 +123,7 @@ def _open_locked(path: Path, permissions: int) -> tuple[Path, BinaryIO]:
 
 
 def _remove_if_left(part: Path) -> None:
-    """Remove a file that nobody writes."""
+    """Remove an unlocked file."""
     try:
         with part.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

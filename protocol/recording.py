@@ -1,7 +1,7 @@
-"""Recordings: MCAP files, mostly of JSON messages with Foxglove's names of schemas, which Foxglove and Rerun show.
+"""Recordings: MCAP files, mostly JSON messages with Foxglove's schema names, for Foxglove and Rerun.
 
-A recording is written as FILE.part, and takes its name once it is complete. A kill or a full disk leaves FILE.part, of
-which all but the last FLUSH_S seconds can be read. Needs the extra `record`.
+Written as FILE.part and renamed when complete. After a kill or on a full disk, FILE.part can be read except for its
+last FLUSH_S seconds. Needs the extra `record`.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import Any, NamedTuple
 from protocol.errors import ConfigError
 from protocol.files import sync_folder
 
-FLUSH_S = 10.0  # between two flushes of what was written: the most that a kill loses
-MOST_BYTES = 2**28  # of one record of a file: a damaged length takes no more memory
-MOST_TOPICS = 2**16 - 2  # MCAP numbers them with 16 bits
-MSGPACK = ""  # schema of messages as they came over the wire
+FLUSH_S = 10.0  # interval of flushes: the most a kill loses
+MOST_BYTES = 2**28  # bound of a record, against damaged lengths
+MOST_TOPICS = 2**16 - 2  # MCAP numbers topics with 16 bits
+MSGPACK = ""  # schema of wire messages
 
 
 class Message(NamedTuple):
-    """One message. schema: its name. log_ns: when it was recorded. stamp_ns: when it was true."""
+    """One message. log_ns: when recorded; stamp_ns: when true."""
 
     topic: str
     schema: str
@@ -36,15 +36,15 @@ class Message(NamedTuple):
 
 
 def time_of(stamp_ns: int) -> dict[str, int]:
-    """A stamp as Foxglove has it."""
+    """A stamp as in Foxglove."""
     return dict(zip(("sec", "nsec"), divmod(stamp_ns, 10**9), strict=True))
 
 
 class Recording:
-    """A file that is being written. counts: messages by topic. excluded: of topics beyond MOST_TOPICS."""
+    """A file being written. counts: messages by topic. excluded: beyond MOST_TOPICS."""
 
     def __init__(self, path: Path, about: Mapping[str, str], clock: Callable[[], float] = time.monotonic) -> None:
-        """about: whose it is. ConfigError where an interrupted recording of this name lies there; OSError."""
+        """Begin with metadata `about`. ConfigError if an interrupted recording has this name; OSError."""
         from mcap.writer import Writer
 
         self.path, self.part = path, path.with_name(f"{path.name}.part")
@@ -66,11 +66,11 @@ class Recording:
 
     @property
     def size(self) -> int:
-        """Bytes of the file by now."""
+        """Bytes so far."""
         return self._file.tell()
 
     def write(self, message: Message, properties: Mapping[str, Any]) -> None:
-        """Add a message. properties: of its schema, as JSON Schema has them. OSError where there is no room."""
+        """Add a message; properties: JSON Schema of its schema. OSError on a full disk."""
         channel = self._channels.get(message[:2])
         if not channel and len(self._channels) == MOST_TOPICS:
             self.excluded += 1
@@ -81,14 +81,14 @@ class Recording:
         self.counts[message.topic] += 1
 
     def tend(self) -> None:
-        """Flush what was written, if that is due; call it every second."""
+        """Flush if due; call it every second."""
         if self._clock() >= self._flush_s:
             self._flush_s = self._clock() + FLUSH_S
             with self._named():
                 self._writer.flush()
 
     def finish(self) -> None:
-        """Complete the file, and give it its name."""
+        """Complete and rename the file."""
         with self._named():
             self._writer.finish()
             self._file.flush()
@@ -98,7 +98,7 @@ class Recording:
             sync_folder(self.path.parent)
 
     def abandon(self) -> None:
-        """Leave FILE.part as it is."""
+        """Leave FILE.part."""
         with suppress(OSError):
             self._file.close()
 
@@ -112,7 +112,7 @@ class Recording:
 
     @contextmanager
     def _named(self) -> Iterator[None]:
-        """Errors of a full disk name no file by themselves."""
+        """Add the file name to errors of a full disk."""
         try:
             yield
         except OSError as error:
@@ -121,13 +121,13 @@ class Recording:
 
 @dataclass
 class RecordedFile:
-    """A recording that is read, also one that was interrupted. is_cut: whether it was; known once all is read."""
+    """A recording being read, maybe interrupted. is_cut: whether it was, known at its end."""
 
     path: Path
     is_cut: bool = field(default=False, init=False)
 
     def messages(self) -> Iterator[Message]:
-        """Messages in the order in which they were recorded; ConfigError where the file is none, or is damaged."""
+        """Messages as recorded; ConfigError if damaged or no recording."""
         from mcap.records import Channel, Schema
         from mcap.records import Message as Record
         from mcap.stream_reader import StreamReader
@@ -145,7 +145,7 @@ class RecordedFile:
                         schemas[record.id] = record.name
             except OSError:
                 raise
-            except Exception as error:  # the library has an error of its own for each kind of damage, and Python's too
+            except Exception as error:  # the library and Python have an error per kind of damage
                 self.is_cut = is_begun and not file.read(1)
                 if not self.is_cut:
                     raise ConfigError(self.path, f"no MCAP file, or damaged: {error or type(error).__name__}") from None

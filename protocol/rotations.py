@@ -1,7 +1,7 @@
 """Rotations and angles (REP-103): yaw @ pitch @ roll, pitch positive nose down, angles in [-pi, pi).
 
-Everything takes one attitude or arrays of them; vectors, matrices and quaternions (x, y, z, w) hold their axes first.
-Plain sums of products rather than `@` and `einsum`, which round differently with the number of attitudes.
+One attitude or arrays; vectors, matrices and quaternions (x, y, z, w) have their axes first. Plain sums of products,
+since `@` and `einsum` round differently with the number of attitudes.
 """
 
 import math
@@ -16,12 +16,12 @@ Angle = TypeVar("Angle", float, Floats)
 
 
 def wrap_angle(angle_rad: Angle) -> Angle:
-    """The same angle [rad] in [-pi, pi)."""
+    """The angle [rad] in [-pi, pi)."""
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 
 def matrix_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> Floats:
-    """Rotation matrix (3, 3, ...) of angles (...): it turns vectors of the rolled frame into the fixed one."""
+    """Rotation matrix (3, 3, ...) of angles (...), from the rolled frame into the fixed one."""
     cr, cp, cy = np.cos(roll_rad), np.cos(pitch_rad), np.cos(yaw_rad)
     sr, sp, sy = np.sin(roll_rad), np.sin(pitch_rad), np.sin(yaw_rad)
     return np.array(
@@ -34,14 +34,14 @@ def matrix_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLik
 
 
 def rpy_from_matrix(rotation: Floats) -> Floats:
-    """Roll, pitch and yaw (3, ...) [rad] of rotation matrices (3, 3, ...)."""
+    """Roll, pitch, yaw (3, ...) [rad] of matrices (3, 3, ...)."""
     r = rotation
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Floats:
-    """Rotation matrix (3, 3, ...) of quaternions (4, ...), which need not have the length 1."""
+    """Rotation matrix (3, 3, ...) of quaternions (4, ...) of any length."""
     q = np.asarray(quaternion, np.float64)
     x, y, z, w = q / np.sqrt((q * q).sum(axis=0))
     return np.array(

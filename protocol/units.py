@@ -1,4 +1,4 @@
-"""Units that logs come in, their factor to the unit that a field's suffix names; spans of time, standard gravity."""
+"""Units of logs and their factors to field suffixes; time spans, standard gravity."""
 
 import math
 import re
@@ -11,7 +11,7 @@ MINUTE_NS = 60 * 10**9
 HOUR_NS = 60 * MINUTE_NS
 DAY_NS = 24 * HOUR_NS
 
-# unit -> {suffix of a field: factor from the unit to what the suffix means}
+# unit -> {field suffix: factor from the unit}
 _UNITS: dict[str, dict[str, float]] = {
     "m": {"_m": 1.0},
     "mm": {"_m": 1e-3},
@@ -37,13 +37,13 @@ _UNITS: dict[str, dict[str, float]] = {
     "s": {"_s": 1.0},
 }
 _NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-ISO, DDMM = "iso", "ddmm"  # texts in place of numbers: a time with its zone; degrees and minutes as NMEA has them
+ISO, DDMM = "iso", "ddmm"  # texts: a time with zone; NMEA degrees and minutes
 _FRACTION = re.compile(r"[.,](\d+)")
 _DDMM = re.compile(r"([-+]?)(\d{0,3})([0-5]\d(?:\.\d*)?) ?([NSEW]?)")
 
 
 def factor(unit: str, field: str) -> float:
-    """Factor from `unit` to the unit of `field`; ValueError if the unit is not known or does not fit."""
+    """Factor from `unit` to that of `field`; ValueError if unknown or unfit."""
     if unit not in _UNITS:
         raise ValueError(f"unit `{unit}` is not known; known: {', '.join(_UNITS)}")
     suffix = "_" + field.rsplit("_", 1)[-1]
@@ -53,14 +53,14 @@ def factor(unit: str, field: str) -> float:
 
 
 def stamp_scale(unit: str) -> int:
-    """Nanoseconds in one `unit`; ValueError if that is no unit of time."""
+    """Nanoseconds per `unit`; ValueError."""
     if unit not in _NS:
         raise ValueError(f"unit `{unit}` is no unit of time; known: {', '.join((*_NS, ISO))}")
     return _NS[unit]
 
 
 def stamp_ns(text: str, scale: int) -> int:
-    """Parse a time; whole numbers exactly, because a double holds UTC nanoseconds only to 256 ns."""
+    """Parse a time; integers exactly, as doubles hold UTC nanoseconds only to 256 ns."""
     try:
         return int(text) * scale
     except ValueError:
@@ -68,7 +68,7 @@ def stamp_ns(text: str, scale: int) -> int:
 
 
 def iso_ns(text: str) -> int:
-    """UTC nanoseconds of an ISO 8601 time with its zone, exact to 9 decimals; ValueError."""
+    """UTC nanoseconds of an ISO 8601 time with zone, to 9 decimals; ValueError."""
     fraction = _FRACTION.search(text)
     try:
         time = datetime.fromisoformat(_FRACTION.sub("", text.strip(), 1))
@@ -81,7 +81,7 @@ def iso_ns(text: str) -> int:
 
 
 def ddmm_deg(text: str, side: str = "", sides: str = "NSEW") -> float:
-    """Degrees of ddmm.mmmm. side: one of `sides`, where it is neither the text's last letter nor a sign; ValueError."""
+    """Degrees of ddmm.mmmm; ValueError. side: one of `sides`, unless a last letter or a sign says it."""
     if not (match := _DDMM.fullmatch(text.strip())) or (match[4] and (side or match[1])):
         raise ValueError("is not ddmm.mmmm, with minutes below 60")
     if (letter := side.strip() or match[4]) not in ("", *sides):

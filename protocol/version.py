@@ -1,12 +1,12 @@
-"""The version of this package."""
+"""The package version."""
 
 from importlib.metadata import PackageNotFoundError, version
 
-UNKNOWN = "unknown"  # run from its sources, without being installed
+UNKNOWN = "unknown"  # not installed
 
 
 def package_version() -> str:
-    """The installed version, or UNKNOWN."""
+    """Installed version, or UNKNOWN."""
     try:
         return version("sitegrid")
     except PackageNotFoundError:

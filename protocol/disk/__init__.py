@@ -1,1 +1,1 @@
-"""Whether a SQLite database on disk still has all that was committed to it."""
+"""Whether a SQLite database still has all its commits."""

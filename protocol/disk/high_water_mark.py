@@ -1,13 +1,11 @@
-"""A high-water mark beside a database: numbers that were committed to it, to be compared when it is opened again.
+"""A high-water mark beside a database: committed numbers, compared at the next opening.
 
-The file NAME-mark is a chain of records; a record has the numbers that a commit changed, and a checksum that begins
-with that of the record before. It is read up to the first record that is not sound; the newest value of a name counts.
+NAME-mark is a chain of records: the numbers that a commit changed, and a checksum continuing the last record's. Reading
+stops at the first unsound record; a name's newest value counts.
 
-A record is written after its commit is on disk, and is not synced: a mark never claims more than the database had, and
-a power cut may leave it behind or torn, which is no alarm. So it costs one write and no sync, and tells of all that was
-committed before a kill, or some seconds before a power cut: then the system has written it to disk by itself.
-
-`Traces` are what lies beside a SQLite database: its write-ahead log, and its mark.
+A record follows its commit and is not synced: a mark never claims too much, and one left behind or torn by a power cut
+raises no alarm. For one write and no sync it covers every commit before a kill, or some seconds before a power cut.
+`Traces` are a database's write-ahead log and mark.
 """
 
 from __future__ import annotations
@@ -26,23 +24,23 @@ from protocol.disk.write_ahead_log import FRAME_HEADER, HEADER, LogScan, scan
 from protocol.errors import StoreError
 from protocol.files import PRIVATE, whole_file, write_whole
 
-_RECORD = struct.Struct("<II")  # length and checksum, before the values
-LIMIT = 2**20  # bytes; a longer file is written anew with the newest values alone
-_OFTEN = 400  # bytes for each value: about ten times what it needs
+_RECORD = struct.Struct("<II")  # length and checksum before the values
+LIMIT = 2**20  # bytes beyond which the newest values are written anew
+_OFTEN = 400  # bytes per value, ten times its need
 
 
 def mark_path(database: Path) -> Path:
-    """Where the mark of a database lies."""
+    """Path of a database's mark."""
     return database.with_name(f"{database.name}-mark")
 
 
 def read_mark(path: Path) -> dict[str, int]:
-    """The newest value of each name; none where there is no mark, or none that is sound. Raises OSError."""
+    """Newest value by name, none without a sound mark; OSError."""
     return _read(path)[0]
 
 
 class HighWaterMark:
-    """One writer's mark. values: the newest ones. Raises OSError only where the file cannot be opened."""
+    """A writer's mark. values: the newest. OSError only if it cannot be opened."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -51,7 +49,7 @@ class HighWaterMark:
         self._file = os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE)
 
     def write(self, values: Mapping[str, int]) -> None:
-        """Note what has just been committed; a disk that takes no more leaves the mark behind until it does."""
+        """Note a commit; a full disk delays the mark."""
         self.values.update(values)
         self._unwritten.update(values)
         with contextlib.suppress(OSError):
@@ -61,20 +59,20 @@ class HighWaterMark:
                 self._append()
 
     def replace(self, values: Mapping[str, int]) -> None:
-        """Note these values and no others, when the database was compared with the mark; raises OSError."""
+        """Note exactly these values, after comparison; OSError."""
         if values != self.values:
             self.values = dict(values)
             self._write_anew()
 
     def close(self) -> None:
-        """Close the file; nothing is written from then on."""
+        """Close the file."""
         if self._file >= 0:
             os.close(self._file)
-        self._file = -1  # never a number that another file gets
+        self._file = -1  # another file may get its number
 
     def _append(self) -> None:
         record, crc = _record(self._unwritten, self._crc)
-        if os.pwrite(self._file, record, self._end) == len(record):  # else the next one takes its place
+        if os.pwrite(self._file, record, self._end) == len(record):  # else the next one replaces it
             self._end, self._crc = self._end + len(record), crc
             self._unwritten.clear()
 
@@ -95,7 +93,7 @@ def _record(values: Mapping[str, int], crc: int) -> tuple[bytes, int]:
 
 
 def _read(path: Path) -> tuple[dict[str, int], int, int]:
-    """Newest values, where the sound records end, and the checksum of the last one."""
+    """Newest values, end of sound records, last checksum."""
     values: dict[str, int] = {}
     try:
         data = path.read_bytes()
@@ -115,9 +113,9 @@ def _read(path: Path) -> tuple[dict[str, int], int, int]:
 
 @dataclass(frozen=True)
 class Traces:
-    """What lies beside a database that nobody has open. mark: see `HighWaterMark`; log: its write-ahead log.
+    """Traces beside a closed database. mark: see `HighWaterMark`; log: its write-ahead log.
 
-    cut_short: the bytes of a log that SQLite does not take to its end, and soon writes over; else empty.
+    cut_short: bytes of a log that SQLite will not fully use and soon overwrites, else empty.
     """
 
     mark: dict[str, int]
@@ -127,20 +125,20 @@ class Traces:
 
     @property
     def damage(self) -> str:
-        """What is wrong with the log, empty where nothing is."""
+        """Damage of the log, or ""."""
         if self.log.damaged_at is None:
             return ""
         dropped = self.log.frames - self.log.recovered
         return f"{self.log_path.name} is damaged at byte {self.log.damaged_at}: its last {dropped} pages cannot be used"
 
     def keep_log(self, number: int) -> None:
-        """Keep a copy of a log that was cut short, for a person; raises OSError."""
+        """Copy a log that was cut short, for a person; OSError."""
         if self.cut_short:
             write_whole(self.log_path.with_name(f"{self.log_path.name}.damaged-{number}"), self.cut_short, PRIVATE)
 
 
 def look_beside(database: Path) -> Traces:
-    """Look before SQLite opens a database, and drops what it cannot use; StoreError where that cannot be read."""
+    """Read traces before SQLite opens a database and drops what it cannot use; StoreError."""
     log_path = database.with_name(f"{database.name}-wal")
     try:
         log = log_path.read_bytes() if log_path.exists() else b""

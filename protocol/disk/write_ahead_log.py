@@ -1,14 +1,12 @@
-"""SQLite's write-ahead log, looked at to its end: damage in the middle is told from a torn tail.
+"""SQLite's write-ahead log, read to its end: distinguishes damage in the middle from a torn tail.
 
-SQLite recovers a log up to the first frame that is not sound, and drops what follows without a word. That is right
-for a power cut, which may leave any part of the last, unsynced transaction, also later frames without earlier ones.
-But with `synchronous=FULL` a transaction begins only once the one before it is on disk. So a frame that follows soundly
-on a commit beyond the first unsound frame proves that this commit was on disk, and that the log was damaged since.
+SQLite recovers up to the first unsound frame and silently drops the rest. That suits power cuts, which may leave any
+part of the last, unsynced transaction. But with `synchronous=FULL` a transaction starts only once the one before is on
+disk. So a sound frame that continues a commit beyond the first unsound frame proves damage.
 
-The format is that of https://sqlite.org/fileformat2.html#walformat: a header of 32 bytes, then frames of 24 bytes and a
-page. Each frame has the salts of the header, and a checksum that begins with that of the frame before. A frame is
-compared with the checksum that the frame before has *stored*, so each stands for itself. What transactions that were
-rolled back left behind the end never follows soundly on another's commit: the checksums before it differ.
+Format: https://sqlite.org/fileformat2.html#walformat, a header of 32 bytes, then frames of 24 bytes and a page. Frames
+have the header's salts and a checksum that continues the frame before. Each is compared with the *stored* one, so it
+stands for itself. Leftovers of rolled-back transactions never continue another's commit soundly.
 """
 
 from __future__ import annotations
@@ -22,19 +20,19 @@ import numpy as np
 from protocol.arrays import AnyArray, Bools
 
 HEADER, FRAME_HEADER = 32, 24
-_MAGIC = 0x377F0682  # its lowest bit is set where checksums are over big-endian words
+_MAGIC = 0x377F0682  # lowest bit set: checksums over big-endian words
 _WORD_ORDERS = ("<u4", ">u4")
 _PAGE_SIZES = tuple(2**n for n in range(9, 17))
-_SALTS = slice(8, 16)  # in the header of a frame
+_SALTS = slice(8, 16)  # in a frame's header
 _FRAMES_AT_ONCE = 1000
 
 
 @dataclass(frozen=True)
 class LogScan:
-    """What a log holds. frames: of its present use; recovered: how many of them SQLite takes.
+    """A log's contents. frames: of its current use; recovered: taken by SQLite.
 
-    damaged_at: byte of the first unsound frame, or 0 for the header, where transactions were on disk beyond it; None
-    for a log that is whole or has a torn tail.
+    damaged_at: byte of the first unsound frame, or 0 for the header, with transactions beyond it; None for a whole log
+    or torn tail.
     """
 
     frames: int = 0
@@ -43,7 +41,7 @@ class LogScan:
 
 
 def scan(log: bytes) -> LogScan:
-    """Look at the bytes of a log. Nobody may be writing it meanwhile."""
+    """Scan a log that nobody is writing."""
     if len(log) < HEADER:
         return LogScan()
     words = np.frombuffer(log[:HEADER], ">u4")
@@ -59,7 +57,7 @@ def scan(log: bytes) -> LogScan:
 
 
 def _without_header(log: bytes) -> LogScan:
-    """SQLite takes nothing of such a log: whether it had anything shows by frames alone, whatever their size."""
+    """Such a log is ignored by SQLite; frames of any size show lost transactions."""
     for page in _PAGE_SIZES:
         second = HEADER + FRAME_HEADER + page
         for order in _WORD_ORDERS:
@@ -71,7 +69,7 @@ def _without_header(log: bytes) -> LogScan:
 
 
 def _scan_frames(log: bytes, page: int, order: str, salts: bytes, before: AnyArray | None) -> LogScan:
-    """before: the checksum of the header, None where that is damaged."""
+    """Scan frames; before: the header's checksum, None if damaged."""
     size = FRAME_HEADER + page
     n = (len(log) - HEADER) // size
     if n < 1 or len(salts) < 8:
@@ -84,16 +82,16 @@ def _scan_frames(log: bytes, page: int, order: str, salts: bytes, before: AnyArr
     frames, is_present = frames[:n], is_present[:n]
     is_sound = is_present & np.concatenate([*_are_sound(frames, order, before), np.zeros(0, np.bool_)])
     is_commit: Bools = np.any(frames[:, 4:8], axis=1)
-    first = int(np.append(is_sound, False).argmin())  # that is not sound
+    first = int(np.append(is_sound, False).argmin())  # first unsound frame
     recovered = int(is_commit[:first].nonzero()[0].max(initial=-1)) + 1
     stands_on_commit = (is_commit[:-1] & is_sound[1:])[first:].any()
     return LogScan(n, recovered, HEADER + first * size if stands_on_commit else None)
 
 
 def _are_sound(frames: AnyArray, order: str, before: AnyArray | None) -> Iterator[Bools]:
-    """Whether each frame has the checksum that follows from the one stored before it; in pieces."""
+    """Whether each frame's checksum continues the stored one before it; in pieces."""
     stored = np.ascontiguousarray(frames[:, 16:24]).view(">u4").astype(np.uint32)
-    first = before if before is not None else ~stored[:1].ravel()  # nothing follows on a damaged header
+    first = before if before is not None else ~stored[:1].ravel()
     earlier = np.concatenate([first[None, :], stored[:-1]])
     for at in range(0, len(frames), _FRAMES_AT_ONCE):
         piece = slice(at, at + _FRAMES_AT_ONCE)
@@ -104,10 +102,10 @@ def _are_sound(frames: AnyArray, order: str, before: AnyArray | None) -> Iterato
 
 
 def _checksums(words: AnyArray, before: AnyArray) -> AnyArray:
-    """Checksums (n, 2) of rows of words (n, 2 k), begun with `before` (n, 2); all modulo 2**32.
+    """Checksums (n, 2) of rows of words (n, 2 k), continuing `before` (n, 2), modulo 2**32.
 
-    SQLite adds pairs of words in turn, s0 += x0 + s1, s1 += x1 + s0: with M = ((1, 1), (1, 2)) that is
-    s = M^k before + sum of M^(k-1-i) (x0, x0 + x1), so each word has a weight of its own.
+    SQLite's s0 += x0 + s1, s1 += x1 + s0 is, with M = ((1, 1), (1, 2)), s = M^k before + sum of M^(k-1-i) (x0, x0 +
+    x1): a weight per word.
     """
     weights, power = _weights(words.shape[1] // 2)
     sums: AnyArray = words @ weights + before @ power
@@ -116,7 +114,7 @@ def _checksums(words: AnyArray, before: AnyArray) -> AnyArray:
 
 @lru_cache(maxsize=4)
 def _weights(pairs: int) -> tuple[AnyArray, AnyArray]:
-    """Weights (2 pairs, 2) of words, and M^pairs (2, 2)."""
+    """Weights (2 pairs, 2), and M^pairs (2, 2)."""
     weights = np.empty((2 * pairs, 2), np.uint32)
     a, b, d = 1, 0, 1  # M^k = ((a, b), (b, d)): Fibonacci numbers
     for pair in range(pairs - 1, -1, -1):

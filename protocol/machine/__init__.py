@@ -1,1 +1,1 @@
-"""A machine: its body and sensors, what these read, the samples it sends, and logs of it."""
+"""A machine: body, sensors, readings, samples, logs."""

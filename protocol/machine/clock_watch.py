@@ -1,7 +1,6 @@
-"""Stamps that do not go on from those before them: astray, or of a clock that was set. One rule for files and streams.
+"""Stamps that do not continue earlier ones: stray, or by a clock that was set. For files and streams.
 
-A stamp that is far off does not count at first. Where others go on from it, and few go on from those before, the clock
-was set: then they count.
+If others continue a distant stamp, and few the earlier ones, the clock was set, and it counts.
 """
 
 from collections.abc import Sequence
@@ -10,18 +9,18 @@ from typing import Generic, TypeVar
 
 from protocol.units import HOUR_NS
 
-GAP_NS = 5_000_000_000  # a stamp that is further ahead is a pause, a clock that was set, or astray
-STEADY_NS = 1_000_000_000  # stamps ahead that go on for longer, with none of before among them, are no error of one row
-LATE_LIMIT = 200  # so many more stamps behind than in order are a clock that was set back, not a late sensor
-LONG_NS = 12 * HOUR_NS  # no recording pauses for longer: the rows at one side of such a break are astray
-MOST_RUNS = 8  # that are weighed at a time: a file without any order has no end of them
+GAP_NS = 5_000_000_000  # a larger lead is a pause, a clock change, or stray
+STEADY_NS = 1_000_000_000  # uninterrupted distant stamps for longer are no single error
+LATE_LIMIT = 200  # surplus of late stamps that means a clock set back, not a late sensor
+LONG_NS = 12 * HOUR_NS  # no recording pauses longer: one side of such a break is stray
+MOST_RUNS = 8  # weighed at a time; a file without order has endless runs
 
 Item = TypeVar("Item")
 
 
 @dataclass(eq=False)
 class _Run(Generic[Item]):
-    """Stamps that go on from one another alone. steady_ns: since when none of before came. excess: over those."""
+    """Stamps that continue only each other. steady_ns: since the last earlier one. excess: over those."""
 
     is_ahead: bool
     newest_ns: int
@@ -31,9 +30,9 @@ class _Run(Generic[Item]):
 
 
 class ClockWatch(Generic[Item]):
-    """Tells stamps that count from those that do not.
+    """Separates valid from stray stamps.
 
-    late_ns: how far one may be behind the newest. newest_ns, counted: of those that count, since the clock was set.
+    late_ns: allowed lateness. newest_ns, counted: of valid ones, since the clock was set.
     """
 
     def __init__(self, late_ns: int = 0) -> None:
@@ -43,17 +42,17 @@ class ClockWatch(Generic[Item]):
         self._runs: list[_Run[Item]] = []
 
     def goes_on(self, stamp_ns: int) -> bool:
-        """Whether a stamp goes on from those that count."""
+        """Whether a stamp continues the valid ones."""
         return not self.newest_ns or self.newest_ns - self._late_ns <= stamp_ns <= self.newest_ns + GAP_NS
 
     def count(self, stamp_ns: int) -> Sequence[Item]:
-        """Note a stamp that goes on; returns the items that are known to be astray thereby."""
+        """Note a continuing stamp; returns items now known as stray."""
         self.newest_ns = max(self.newest_ns, stamp_ns)
         self.counted += 1
         return self._weigh() if self._runs else ()
 
     def doubt(self, stamp_ns: int, item: Item) -> tuple[Sequence[Item], Sequence[Item]]:
-        """Note one that does not go on; returns the items that count once the clock was set, and those astray then."""
+        """Note another stamp; returns items that count if the clock was set, and those then stray."""
         is_ahead = stamp_ns > self.newest_ns
         fitting = [r for r in self._runs if r.is_ahead == is_ahead and r.newest_ns - self._late_ns <= stamp_ns]
         run = max(fitting, key=lambda r: r.newest_ns, default=None)
@@ -70,13 +69,13 @@ class ClockWatch(Generic[Item]):
         return run.items, self._give_up(self._runs)
 
     def end(self) -> tuple[Sequence[Item], Sequence[Item]]:
-        """The same, as the stream ends: what is behind a pause counts."""
+        """The same at the end; items after a pause count."""
         paused = [r for r in self._runs if r.is_ahead and r.newest_ns < self.newest_ns + LONG_NS][:1]
         counting = [item for run in paused for item in run.items]
         return counting, self._give_up([r for r in self._runs if r not in paused])
 
     def _is_set(self, run: _Run[Item]) -> bool:
-        """Whether a clock was set to the time of a run. Few stamps of before are outvoted by as many of far away."""
+        """Whether the clock was set to a run's time. As many distant stamps outvote few earlier ones."""
         if run.is_ahead and run.newest_ns - run.steady_ns > STEADY_NS:
             return True
         return run.excess > (LATE_LIMIT if self._is_near(run) else min(LATE_LIMIT, self.counted))
@@ -85,7 +84,7 @@ class ClockWatch(Generic[Item]):
         return abs(run.newest_ns - self.newest_ns) <= GAP_NS + self._late_ns
 
     def _weigh(self) -> Sequence[Item]:
-        """Weigh a stamp that counts against the runs. Those nearby are of a late sensor: it outweighs all of them."""
+        """Weigh a valid stamp against runs; it clears nearby ones, of a late sensor."""
         for run in self._runs:
             run.steady_ns = 0
             run.excess = 0 if self._is_near(run) else run.excess - 1

@@ -1,4 +1,4 @@
-"""CSV files of logs: how a manifest describes a file and its columns, and what its rows hold (docs/log-folders.md)."""
+"""CSV files of logs: description in the manifest, and rows (docs/log-folders.md)."""
 
 import csv
 import gzip
@@ -15,20 +15,20 @@ from protocol.config import from_table
 from protocol.errors import ConfigError, LogFolderError, RowError
 from protocol.units import DDMM, ISO, ddmm_deg, factor, iso_ns, stamp_ns, stamp_scale
 
-MAX_LINE = 2**20  # characters of a CSV file
-MAX_COLUMNS = 1000  # of a CSV file
-SIDES = {"lat_deg": "NS", "lon_deg": "EW"}  # of the world, of positions in degrees and minutes
-SPACES = " "  # as a delimiter: any number of spaces and tabs
+MAX_LINE = 2**20  # characters
+MAX_COLUMNS = 1000
+SIDES = {"lat_deg": "NS", "lon_deg": "EW"}  # hemisphere letters of positions in degrees and minutes
+SPACES = " "  # delimiter: any spaces and tabs
 DELIMITERS = (",", ";", "\t", SPACES)
-Row = Mapping[str, str]  # texts by column
+Row = Mapping[str, str]  # text by column
 
 
 @dataclass(frozen=True)
 class CsvFile:
     """A CSV file of the data folder.
 
-    names: of its columns, where its first line does not name them; lines that begin with # are comments then. at_least:
-    the least values of columns that say whether a row counts, as a receiver's kind of fix does.
+    names: columns of a file without header; lines with # are comments then. at_least: least values of columns for a row
+    to count, such as a receiver's fix quality.
     """
 
     file: str
@@ -43,18 +43,18 @@ class CsvFile:
             raise ValueError(f"names: {twice[0]!r} is empty, or stands there twice")
 
     def check(self, row: Row) -> None:
-        """Raise RowError on a row that does not count, ValueError where that cannot be known."""
+        """RowError for a row that does not count, ValueError if unknown."""
         for name, least in self.at_least.items():
-            if not float(row[name]) >= least:  # also true for NaN
+            if not float(row[name]) >= least:  # also for NaN
                 raise RowError("below_least", f"{name}: {row[name]} is below {least:g}")
 
 
 @dataclass(frozen=True)
 class Column:
-    """A value of a row: the sum of CSV columns times their weights, plus an offset, in a unit; it may be constant.
+    """A row's value: weighted sum of CSV columns plus offset, in a unit; or a constant.
 
-    over: a column that the sum is divided by, as power is by speed; "" for none. Where it is 0, so is the quotient.
-    side: of a position as ddmm.mmmm, the column with N, S, E or W; "" where that stands behind the number.
+    over: column that divides the sum, as power by speed, 0 for 0; or "". side: column with N, S, E or W of a ddmm.mmmm
+    position; "" if behind the number.
     """
 
     weights: Mapping[str, float] = field(default_factory=dict, hash=False)
@@ -65,18 +65,18 @@ class Column:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The CSV columns that it needs."""
+        """Required CSV columns."""
         return tuple(filter(None, (*self.weights, self.over, self.side)))
 
     def text(self, unit: str) -> str:
-        """The CSV column of a text in place of a number; ValueError where more than that is described."""
+        """The CSV column of a text value; ValueError if more is described."""
         only, *_ = *self.weights, ""
         if not only or self != Column({only: 1.0}, unit, side=self.side if unit == DDMM else ""):
             raise ValueError(f"unit `{unit}` is of a column alone, without weight, offset or quotient")
         return only
 
     def problem(self, field_: str, row: Row) -> str:
-        """Why a row has no value of that field, with column and text; empty where each text can be read."""
+        """Why a row lacks that field's value, with column and text, or ""."""
         for name in filter(lambda name: name != self.side, self.columns):
             if not (text := row[name]):
                 return f"{name}: a value is missing"
@@ -95,7 +95,7 @@ class Column:
 
 @dataclass(frozen=True)
 class _Written:
-    """A column as the manifest has it, if it is not a mere name."""
+    """A column in the manifest, if not a mere name."""
 
     column: str | None = None
     columns: Mapping[str, float] | None = None
@@ -107,16 +107,16 @@ class _Written:
 
 
 def take_file(table: dict[str, Any], where: str) -> CsvFile:
-    """Take the keys of a CSV file out of a table."""
+    """Take a CSV file's keys out of a table."""
     return from_table(CsvFile, {f.name: table.pop(f.name) for f in fields(CsvFile) if f.name in table}, where)
 
 
 def parse_column(value: Any, name: str, where: str) -> Column:
-    """Parse what a manifest writes for a field of that name; raises ConfigError, also on a unit that does not fit."""
+    """Parse a field's column; ConfigError, also for an unfit unit."""
     column = Column({value: 1.0}) if isinstance(value, str) and value else _parse_table(value, where)
     try:
         stamp_reader(column) if name == "stamp" else number_reader(column, name)
-    except (ValueError, OverflowError) as error:  # a weight that no number holds
+    except (ValueError, OverflowError) as error:  # also of a weight too large for a number
         raise ConfigError(where, str(error)) from None
     return column
 
@@ -140,9 +140,9 @@ def _parse_table(value: Any, where: str) -> Column:
 
 
 def number_reader(column: Column, name: str) -> Callable[[Row], float]:
-    """What makes the value of a field of a row, in the unit of the field's suffix.
+    """Function from a row to a field's value, in its suffix's unit.
 
-    Raises ValueError if the unit is not known or does not fit; so does what it returns on a text that is no number.
+    ValueError for an unknown or unfit unit; its result raises ValueError for text that is no number.
     """
     if column.unit == DDMM or column.side:
         return _ddmm_reader(column, name)
@@ -162,7 +162,7 @@ def number_reader(column: Column, name: str) -> Callable[[Row], float]:
 
 
 def _ddmm_reader(column: Column, name: str) -> Callable[[Row], float]:
-    """As `number_reader`, of a position in degrees and minutes."""
+    """As `number_reader`, of degrees and minutes."""
     only, sides, side = column.text(DDMM), SIDES.get(name, ""), column.side
     if not sides:
         raise ValueError(f"unit `{DDMM}` does not fit `{name}`, but {', '.join(SIDES)}")
@@ -170,10 +170,9 @@ def _ddmm_reader(column: Column, name: str) -> Callable[[Row], float]:
 
 
 def stamp_reader(column: Column, start_ns: int = 0) -> Callable[[Row], int]:
-    """What makes UTC nanoseconds of a row's time, exactly where all its numbers are whole; raises ValueError.
+    """Function from a row to UTC nanoseconds, exact for integers; ValueError.
 
-    start_ns: what numbers count from; ISO times do not. Seconds and nanoseconds may stand in two columns, of weights
-    1.0 and 1e-9.
+    start_ns: origin of numbers, not of ISO times. Seconds and nanoseconds may be two columns, of weights 1.0 and 1e-9.
     """
     if column.unit == ISO:
         only = column.text(ISO)
@@ -192,7 +191,7 @@ def stamp_reader(column: Column, start_ns: int = 0) -> Callable[[Row], int]:
 
 @contextmanager
 def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str]"]:
-    """The rows of a file in a folder; raises LogFolderError where it cannot be read, or lies elsewhere."""
+    """A file's rows; LogFolderError if unreadable or outside the folder."""
     path = folder / csv_file.file
     try:
         check_place(path, folder)
@@ -213,7 +212,7 @@ def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str
 
 
 def check_place(path: Path, folder: Path) -> None:
-    """Refuse what a stranger's manifest may name: files outside of its folder, FIFOs and devices."""
+    """Refuse what a foreign manifest may name: files outside its folder, FIFOs, devices."""
     if "\0" in str(path):
         raise LogFolderError(path, "is no name of a file")
     place = Path(os.path.realpath(path))
@@ -224,7 +223,7 @@ def check_place(path: Path, folder: Path) -> None:
 
 
 def require(names: Iterable[str], rows: "csv.DictReader[str]", path: Path) -> None:
-    """Refuse a file that lacks a column, or has two of its name."""
+    """Refuse a file with a missing or duplicate column."""
     header = list(rows.fieldnames or ())
     if len(header) > MAX_COLUMNS:
         raise LogFolderError(path, f"has {len(header)} columns, over {MAX_COLUMNS}; keep those that the manifest names")
@@ -236,25 +235,22 @@ def require(names: Iterable[str], rows: "csv.DictReader[str]", path: Path) -> No
 
 
 def no_value(row: Row, described: Mapping[str, Column], csv_file: CsvFile) -> str:
-    """Which column of a row has no value of its field, as a sentence. described: columns by field, with the stamp."""
+    """The column without value in a row, as a sentence. described: columns by field, with the stamp."""
     counted = ((name, Column({name: 1.0})) for name in csv_file.at_least)
     problems = (column.problem(name, row) for name, column in (*counted, *described.items()))
-    stamps = described["stamp"].columns  # as NaN, which is a number elsewhere
+    stamps = described["stamp"].columns  # as NaN, a number elsewhere
     return next(filter(None, problems), f"{', '.join(stamps)}: {', '.join(row[name] for name in stamps)!r} is no time")
 
 
 def open_text(path: Path) -> IO[str]:
-    """Open a text file for reading, compressed if its name ends in .gz; raises OSError."""
+    """Open a text file, compressed if .gz; OSError."""
     if path.suffix == ".gz":
         return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
-    return path.open(encoding="utf-8-sig", newline="")  # with or without the mark that spreadsheets write
+    return path.open(encoding="utf-8-sig", newline="")  # with or without a spreadsheet's byte order mark
 
 
 def _lines(text: IO[str], path: Path, csv_file: CsvFile) -> Iterator[str]:
-    """Lines, refused where one is too long: a small compressed file can hold a line of many gigabytes.
-
-    Comments become empty lines, so that the reader counts them and does not read them.
-    """
+    """Lines of bounded length, as a small compressed file can hold gigabytes in one; comments become empty."""
     while line := text.readline(MAX_LINE):
         if len(line) == MAX_LINE:
             raise LogFolderError(path, f"cannot be read: a line is longer than {MAX_LINE} characters")

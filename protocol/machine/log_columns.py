@@ -1,6 +1,6 @@
-"""From columns of a log to the values of a reading: what may stand instead of a column, and what may be absent.
+"""Columns of a log to reading values: alternatives, and defaults.
 
-A log may state places in metres, speed and course, or standard deviations; readings have one form of each.
+Logs may have places in metres, speed and course, or standard deviations; readings have one form of each.
 """
 
 import math
@@ -14,12 +14,12 @@ from protocol.machine.readings import columns
 from protocol.site.site_config import Projection, SiteConfig
 
 Values = dict[str, float]
-# What a log may have instead of two columns of a kind: a place in `map` [m]; speed and course (clockwise from north).
+# Alternatives to two columns: place in `map` [m]; speed and course, clockwise from north.
 INSTEAD = {
     "gps": (("x_m", "y_m"), ("lat_deg", "lon_deg")),
     "gps_velocity": (("speed_mps", "course_deg"), ("velocity_e_mps", "velocity_n_mps")),
 }
-# What the variances of a kind are of, as `std` and `measures` call it.
+# Quantity of each variance, as in `std` and `measures`.
 VARIANCES = {
     "gps": {"var_e_m2": "position", "var_n_m2": "position"},
     "gps_velocity": {"var_e_m2ps2": "velocity", "var_n_m2ps2": "velocity"},
@@ -31,30 +31,27 @@ _MEASURED = {
 }
 _UNUSED = {"gps": {"var_u_m2": 100.0}, "odometry": {"speed_y_mps": 0.0}}  # by nobody yet
 _STD_UNITS = {"_m2": "_m", "_m2ps2": "_mps", "_rad2": "_rad"}
-MAX_FAR_M = 100_000.0  # from the site's origin, its greatest extent; of metres that count from elsewhere
+MAX_FAR_M = 100_000.0  # greatest site extent, against metres from elsewhere
 
 
 def std_name(variance: str) -> str:
-    """The name of a column with standard deviations in place of variances: `std_e_m` of `var_e_m2`."""
+    """Standard deviation column of a variance: `std_e_m` of `var_e_m2`."""
     _, axis, unit = variance.split("_")
     return f"std_{axis}{_STD_UNITS['_' + unit]}"
 
 
 @dataclass(frozen=True)
 class ReadingColumns:
-    """How the rows of a file become the values of a sensor's readings; `described` are the columns of the manifest.
-
-    absent: what stands for columns that are not described.
-    """
+    """File rows to a sensor's reading values. described: of the manifest; absent: defaults of others."""
 
     sensor: SensorConfig
     described: Mapping[str, Column]
     absent: Mapping[str, float]
 
     def reader(self, site: SiteConfig) -> Callable[[Row], tuple[float, ...]]:
-        """What makes the values of a row, in the order of the kind's columns.
+        """Function from a row to values, in the kind's column order.
 
-        It raises ValueError on a text that is no number, MessageError on a value that is impossible.
+        ValueError for text that is no number, MessageError for an impossible value.
         """
         picks = [(name, number_reader(column, name)) for name, column in self.described.items()]
         names, steps, overruled = columns(self.sensor.kind), self._steps(site), self._variances()
@@ -63,15 +60,15 @@ class ReadingColumns:
             made = {**self.absent, **{name: pick(row) for name, pick in picks}}
             for step in steps:
                 step(made)
-            made |= {name: value for name, value in overruled.items() if not made[name] > 0}  # NaN is unknown too
+            made |= {name: value for name, value in overruled.items() if not made[name] > 0}  # also NaN, unknown too
             return tuple(made[name] for name in names)
 
         return values
 
     def _variances(self) -> Values:
-        """What the sensor's `std` states, for rows with 0 or less: many receivers write that where they know none.
+        """Variances by the sensor's `std`, for rows with 0 or less, which many receivers write if unknown.
 
-        A variance that nobody uses refuses no row either.
+        Unused variances refuse no row.
         """
         unused = {name: value for name, value in _UNUSED.get(self.sensor.kind, {}).items() if name.startswith("var_")}
         variances = VARIANCES.get(self.sensor.kind, {}).items()
@@ -80,7 +77,7 @@ class ReadingColumns:
         }
 
     def _steps(self, site: SiteConfig) -> list[Callable[[Values], None]]:
-        """What turns described columns into those of the kind."""
+        """Conversions of described columns."""
         variances = [name for name in columns(self.sensor.kind) if name.startswith("var_")]
         squared = {std: name for name in variances if (std := std_name(name)) in self.described}
         steps: list[Callable[[Values], None]] = [_squares(squared)] if squared else []
@@ -94,7 +91,7 @@ class ReadingColumns:
 def reading_columns(
     sensor: SensorConfig, described: Mapping[str, Column], site: SiteConfig, where: str
 ) -> ReadingColumns:
-    """The columns of a sensor; raises ConfigError on one that is unknown, missing, or there in two forms."""
+    """A sensor's columns; ConfigError for unknown, missing or duplicate ones."""
     kind, names = sensor.kind, columns(sensor.kind)
     new, old = INSTEAD.get(kind, ((), ()))
     forms = {name: (std_name(name),) if name.startswith("var_") else new if name in old else () for name in names}
@@ -114,7 +111,7 @@ def reading_columns(
 
 
 def _value_of_absent(sensor: SensorConfig, name: str, forms: tuple[str, ...], site: SiteConfig, where: str) -> float:
-    """What stands for a column that is not there: of what the sensor does not measure, or states elsewhere."""
+    """Default of a column: unmeasured, or stated elsewhere."""
     if name == "height_m":
         return site.origin_height_m
     if name in (unused := _UNUSED.get(sensor.kind, {})):
@@ -147,7 +144,7 @@ def _places(projection: Projection) -> Callable[[Values], None]:
     def place(values: Values) -> None:
         for name in ("x_m", "y_m"):
             value = values[name]
-            if not abs(value) <= MAX_FAR_M:  # also true for NaN
+            if not abs(value) <= MAX_FAR_M:  # also for NaN
                 reason = Refusal.OUT_OF_RANGE if math.isfinite(value) else Refusal.NOT_FINITE
                 problem = f"{value!r} is not within {MAX_FAR_M / 1000:g} km of the site's origin"
                 raise MessageError(reason, problem, field=name)

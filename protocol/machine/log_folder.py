@@ -1,7 +1,4 @@
-"""Log folders: CSV files and a manifest `log.toml` that describes them (docs/log-folders.md).
-
-The manifest may lie apart from the data, so that logs of others are described without touching them.
-"""
+"""Log folders: CSV files and a manifest `log.toml`, which may lie apart (docs/log-folders.md)."""
 
 import csv
 import heapq
@@ -44,14 +41,14 @@ from protocol.machine.readings import MAX_STAMP_NS, Reading, columns, parse_read
 from protocol.site.site_config import SiteConfig, site_toml
 
 MANIFEST = "log.toml"
-_Numbered = tuple[int, Reading]  # the line of a row, and what it holds
+_Numbered = tuple[int, Reading]  # line and reading of a row
 
 
 @dataclass(frozen=True)
 class SensorFile:
-    """The CSV file of one sensor: its time column, and the columns of its readings.
+    """A sensor's CSV file, its time column and reading columns.
 
-    ahead_s: of its clock, taken off each stamp: a `delay_s` that no reading can have that comes in time.
+    ahead_s: lead of its clock, subtracted from stamps: a `delay_s` too large for live readings.
     """
 
     sensor: SensorConfig
@@ -65,7 +62,7 @@ class SensorFile:
 class LogFolder:
     """A described recording.
 
-    refused: how many rows were skipped while it is read, by reason; first_refused: file, line and problem of the first.
+    refused: skipped rows by reason; first_refused: file, line and problem of the first.
     """
 
     name: str
@@ -78,14 +75,13 @@ class LogFolder:
     first_refused: dict[str, str] = field(default_factory=dict)
 
     def readings(self) -> Iterator[Reading]:
-        """All readings of the sensors in use, as `timed` has them."""
+        """All used readings, ordered as in `timed`."""
         return map(itemgetter(1), self.timed())
 
     def timed(self) -> Iterator[tuple[int, Reading]]:
-        """All readings of the sensors in use, in the order in which the machine had them; counts `refused` anew.
+        """All used readings with arrival time [ns], in that order; restarts `refused`.
 
-        Each with the time [ns] at which the machine had it: at its stamp, but never before it was true (a negative
-        delay). That time goes on where a clock was set back.
+        Arrival is the stamp, but never before it was true, and goes on when a clock is set back.
         """
         self.refused.clear()
         self.first_refused.clear()
@@ -93,7 +89,7 @@ class LogFolder:
         return heapq.merge(*streams, key=itemgetter(0))
 
     def _read(self, source: SensorFile) -> Iterator[tuple[int, Reading]]:
-        """Readings of a file. Rows are held until enough go on from them: the first may be of another clock."""
+        """A file's readings, held until enough continue them: the first may be of another clock."""
         watch, held, newest_ns = ClockWatch[_Numbered](), list[_Numbered](), 0
         later_ns = max(0, source.sensor.true_ns(0))
         for row in self._rows(source):
@@ -117,7 +113,7 @@ class LogFolder:
         yield from ((reading.stamp_ns + later_ns, reading) for _, reading in self._settled(source, [*held, *rows]))
 
     def _settled(self, source: SensorFile, rows: Sequence[_Numbered]) -> Sequence[_Numbered]:
-        """Rows that go on, without a shorter part before a break of LONG_NS: its clock was not set yet."""
+        """Rows without a shorter part before a break of LONG_NS, when the clock was not set."""
         for i in range(len(rows) // 2, 0, -1):
             if rows[i][1].stamp_ns - rows[i - 1][1].stamp_ns > LONG_NS:
                 self._refuse_astray(source, rows[:i], rows[i][1].stamp_ns)
@@ -134,7 +130,7 @@ class LogFolder:
             self.first_refused.setdefault(reason, f"{source.file.file} line {line}: {columns_}: {problem}")
 
     def _rows(self, source: SensorFile) -> Iterator[_Numbered]:
-        """The rows of a file that are readings, each with its line."""
+        """A file's rows that are readings, with line."""
         path, parse = self.data / source.file.file, self._parser(source)
         with opened_rows(source.file, self.data) as rows:
             for column in (source.stamp, *source.columns.described.values()):
@@ -154,7 +150,7 @@ class LogFolder:
             raise LogFolderError(path, f"none of its rows can be used; {problem}")
 
     def _parser(self, source: SensorFile) -> Callable[[Row], Reading]:
-        """What makes a reading of a row; raises RowError."""
+        """Function from row to reading; RowError."""
         sensor, values = source.sensor, source.columns.reader(self.site)
         stamp, ahead_ns = stamp_reader(source.stamp, self.start_ns), round(source.ahead_s * 1e9)
         described = {"stamp": source.stamp, **source.columns.described}
@@ -172,7 +168,7 @@ class LogFolder:
 
 
 def _cells(row: Row, described: Mapping[str, Column], field_: str) -> str:
-    """Which texts of a row a field comes from, behind a sentence on its value."""
+    """Texts of a row behind a field, as an addition to a sentence."""
     name = field_.rpartition(".")[2]
     column = described.get("stamp" if name == "stamp_ns" else name, Column())
     cells = ", ".join(f"`{one}` has {row[one]!r:.40}" for one in column.columns)
@@ -180,9 +176,9 @@ def _cells(row: Row, described: Mapping[str, Column], field_: str) -> str:
 
 
 def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
-    """Read a manifest. manifest: the file, or the folder that holds it as `log.toml`; data: where the CSV files are.
+    """Read a manifest, a file or a folder with `log.toml`; data: folder of the CSV files.
 
-    Raises ConfigError, and LogFolderError where it names what is no regular file of that folder.
+    ConfigError; LogFolderError if a named file is not a regular file of that folder.
     """
     if manifest.is_dir():
         folder, manifest = manifest, manifest / MANIFEST
@@ -217,7 +213,7 @@ def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
 
 @dataclass(frozen=True)
 class _Header:
-    """The manifest's [log]. start_ns: the UTC instant that the time columns count from."""
+    """[log] of the manifest. start_ns: UTC origin of the time columns."""
 
     name: str
     start_ns: int = 0
@@ -237,9 +233,9 @@ def _parse_source(table: Any, site: SiteConfig, where: str) -> SensorFile:
 
 
 def _take_ahead_s(table: dict[str, Any]) -> float:
-    """Take a `delay_s` out of a sensor's table that is an offset of its clock: in a recording nothing comes late."""
+    """Take a `delay_s` that is a clock offset: in a recording nothing is late."""
     delay_s: Any = table.get("delay_s")
-    is_time = type(delay_s) in (int, float) and abs(delay_s) < MAX_STAMP_NS  # not NaN, nor beyond all floats
+    is_time = type(delay_s) in (int, float) and abs(delay_s) < MAX_STAMP_NS  # not NaN or infinite
     if is_time and not -MAX_EARLY_S <= delay_s <= MAX_DELAY_S:
         return float(table.pop("delay_s"))
     return 0.0
@@ -259,7 +255,7 @@ def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig,
 
 @contextmanager
 def log_files(folder: Path, kinds: Mapping[str, str]) -> Iterator[Callable[[str, int, Sequence[float]], None]]:
-    """Write the CSV files of a log folder, by what is yielded: sensor, stamp [ns] and values. kinds: by sensor."""
+    """Write a log folder's CSV files; yields a writer of sensor, stamp [ns], values. kinds: by sensor."""
     with ExitStack() as stack:
         writers = {}
         for sensor, kind in kinds.items():
@@ -272,7 +268,7 @@ def log_files(folder: Path, kinds: Mapping[str, str]) -> Iterator[Callable[[str,
 def manifest_toml(
     name: str, site: SiteConfig, machine: MachineConfig, notes: Mapping[str, Sequence[str]] | None = None
 ) -> str:
-    """The manifest of what `log_files` has written. notes: comments, by sensor; those by "" stand at the top."""
+    """Manifest for `log_files`. notes: comments by sensor; those of "" come first."""
     comments = {sensor: [f"# {one_line(line)}" for line in some] for sensor, some in (notes or {}).items()}
     lines = [*comments.get("", ()), "[log]", *toml_lines({"name": name}), "", "[site]", site_toml(site)]
     lines += ["[machine]", *plain_lines(machine), *powertrain_lines(machine)]

@@ -1,4 +1,4 @@
-"""Description of a machine: the nominal dimensions of its body, and its sensors with their mounting."""
+"""A machine's description: nominal dimensions, and sensors with mounts."""
 
 import json
 import math
@@ -17,8 +17,7 @@ from protocol.rotations import matrix_from_rpy
 from protocol.site.site_config import NAME
 
 BASE, FRONT = "base_link", "front_link"
-# What a kind of sensor measures of the motion, by name. A sensor may measure a part of it: an IMU without an
-# accelerometer, an orientation whose heading is of no use.
+# Quantities of motion by kind of sensor. A sensor may provide only some, as an IMU without accelerometer.
 QUANTITIES = {
     "gps": ("position",),
     "gps_velocity": ("velocity",),
@@ -28,13 +27,13 @@ QUANTITIES = {
     "encoder": ("speed",),
     "steering": ("angle",),
 }
-# How values are meant. Differential: successive ones make a rate. Relative: the first is what the filter believes at
-# that moment, later ones count from it (Moore & Stouch, robot_localization).
+# Meaning of values. Differential: successive ones give a rate. Relative: the first stands for the filter's belief,
+# later ones count from it (Moore & Stouch, robot_localization).
 MODES = ABSOLUTE, DIFFERENTIAL, RELATIVE = ("absolute", "differential", "relative")
 WITH_MODE = ("gps", "attitude")
-MAX_DELAY_S = 0.4  # what is 0.5 s behind the newest reading is refused as late; readings do not arrive in perfect order
-BEFORE_THE_WHEELS = frozenset({"engine", "motor", "motor_power"})  # kinds whose readings need a powertrain
-DRIVES = BEFORE_THE_WHEELS | {"torque"}  # kinds whose readings show the drive force
+MAX_DELAY_S = 0.4  # below 0.5 s, at which readings are refused as late, to allow for disorder
+BEFORE_THE_WHEELS = frozenset({"engine", "motor", "motor_power"})  # kinds that need a powertrain
+DRIVES = BEFORE_THE_WHEELS | {"torque"}  # kinds that show the drive force
 NOT_NEGATIVE = (
     "wheelbase_m",
     "axle_stiffness_npm",
@@ -43,16 +42,16 @@ NOT_NEGATIVE = (
     "drag_area_m2",
     "drive_friction_n",
 )
-MOST_KG = 500_000.0  # of a machine, and of what it carries: a sample states the sum
-LIGHT_KG, LONG_M = 500.0, 1.5  # no machine with a wheelbase this long is so light: its mass was written in tonnes
-FAR_M = 30.0  # of a mount: larger than any machine on wheels or tracks
-MOST_RADIUS_M = 3.0  # of a wheel: the largest tyre there is has 2.05 m
-MAX_EARLY_S = 10.0  # a stamp that is further behind its reading is no delay, but another clock
+MOST_KG = 500_000.0  # of machine or load; samples state the sum
+LIGHT_KG, LONG_M = 500.0, 1.5  # wheelbase for which a smaller mass was written in tonnes
+FAR_M = 30.0  # of a mount, beyond any machine
+MOST_RADIUS_M = 3.0  # of a wheel; the largest tyre has 2.05 m
+MAX_EARLY_S = 10.0  # larger lags of a stamp are clock offsets
 
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a sensor sits in the frame that carries it: its origin [m] and roll, pitch, yaw [deg]."""
+    """A sensor's place in its frame: origin [m], roll, pitch, yaw [deg]."""
 
     xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -63,7 +62,7 @@ class Mount:
             raise ValueError(f"xyz_m: {far_m:g} m is off any machine; {in_m}")
 
     def frame_from_sensor(self) -> Floats:
-        """Rotation matrix (3, 3) from the sensor into the frame that carries it, `base_link` or `front_link`."""
+        """Rotation (3, 3) from the sensor into its frame, `base_link` or `front_link`."""
         return matrix_from_rpy(*np.radians(self.rpy_deg))
 
 
@@ -71,15 +70,12 @@ class Mount:
 class SensorConfig:
     """One sensor of a machine.
 
-    name: as readings carry it. use: false ignores the sensor's readings. measures: which of its quantities are used, by
-    the names in QUANTITIES; empty: all. std: standard deviations by these names, instead of what readings state or the
-    filter's options say: `position` [m]; `tilt`, `heading` [rad]; `rate` [rad/s]; `force` [m/s2]; `speed`,
-    `velocity` [m/s]. mode: one of MODES, for GPS and attitude. delay_s: how much later than it was true a reading is
-    stamped; negative if earlier. gate_sigma: refused if further off than so many standard deviations; 0: as the
-    filter's options say. frame: which frame of an
-    articulated machine carries it; `front_link` starts at the joint, at the height of the wheels' hubs. drift_share,
-    drift_time_s: of a GPS receiver, the share of its variance that is a slow error, and that error's correlation time.
-    ticks_per_rev: of an encoder.
+    name: as in readings. use: false ignores it. measures: used quantities of QUANTITIES; empty: all. std: standard
+    deviations by these names, in place of stated or default ones: `position` [m]; `tilt`, `heading` [rad]; `rate`
+    [rad/s]; `force` [m/s2]; `speed`, `velocity` [m/s]. mode: one of MODES, for GPS and attitude. delay_s: lag of the
+    stamp, negative for a lead. gate_sigma: gate in standard deviations; 0: the filter's. frame: of an articulated
+    machine; `front_link` starts at the joint, at hub height. drift_share, drift_time_s: of a receiver: slow share of
+    its variance, and correlation time. ticks_per_rev: of an encoder.
     """
 
     name: str
@@ -114,7 +110,7 @@ class SensorConfig:
             raise ValueError("drift_time_s and ticks_per_rev must be positive")
 
     def _check_meaning(self) -> None:
-        """Refuse names and modes that its kind does not have."""
+        """Refuse names and modes that the kind lacks."""
         known = QUANTITIES.get(self.kind, ())
         for option, names in (("measures", self.measures), ("std", self.std)):
             if unknown := sorted(set(names) - set(known)):
@@ -128,33 +124,30 @@ class SensorConfig:
             raise ValueError(f"mode: {self.name}: {self.kind} has no {self.mode!r}, but {', '.join(modes)}")
 
     def true_ns(self, stamp_ns: int) -> int:
-        """When that was true which a reading of this stamp measured."""
+        """Time of what a reading of this stamp measured."""
         return stamp_ns - round(self.delay_s * 1e9)
 
     def provides(self, quantity: str) -> bool:
-        """Whether its readings are used for this quantity, one of QUANTITIES."""
+        """Whether a quantity of QUANTITIES is used."""
         return not self.measures or quantity in self.measures
 
     def gate(self, usual_sigma: float) -> float:
-        """Its own gate where it has one, else the usual one [standard deviations]."""
+        """Its gate, else the usual one [standard deviations]."""
         return self.gate_sigma or usual_sigma
 
 
 @dataclass(frozen=True)
 class MachineConfig:
-    """Nominal body of a machine; `base_link` is its rear frame, on the ground below the rear axle's centre.
+    """A machine's nominal body; `base_link` is its rear frame, on the ground below the rear axle's centre.
 
-    load_centre_m: how far ahead of `base_link` the wheel loads' centre lies. rotating_mass_factor: mass plus the
-    wheels' inertia over mass. A machine without a drive torque sensor needs no mass. machine_share: share of the slow
-    variance that its GPS receivers have in common, None to estimate it. skid_steers: whether its two sides drive at
-    different speeds to turn it, None to see it by its turns on the spot.
+    load_centre_m: centre of wheel loads ahead of `base_link`. rotating_mass_factor: mass with wheel inertia over mass.
+    Mass is not needed without a drive torque sensor. machine_share: slow variance common to its receivers, None to
+    estimate it. skid_steers: None to detect it by turns on the spot.
 
-    The rest, 0 where not known: wheelbase_m: from the rear axle to the front one, straight ahead. axle_stiffness_npm:
-    vertical, of the two tyres of one axle together. cog_height_m: of the empty machine's centre of mass above the
-    ground. payload_x_m, payload_z_m: where the centre of what it carries lies, ahead of `base_link` when it stands
-    straight, and above the ground. drag_area_m2: frontal area times drag coefficient. drive_friction_n: of what the
-    torque sensor drives before the wheels, at the wheels, whatever the speed. powertrain: None where torque is read at
-    the wheels.
+    The rest is 0 if unknown: wheelbase_m: of the straight machine. axle_stiffness_npm: vertical, both tyres of an axle.
+    cog_height_m: of the empty machine. payload_x_m, payload_z_m: load centre ahead of `base_link`, straight, and above
+    ground. drag_area_m2: frontal area times drag coefficient. drive_friction_n: at the wheels, between torque sensor
+    and wheels, at any speed. powertrain: None with torque at the wheels.
     """
 
     name: str
@@ -208,12 +201,12 @@ class MachineConfig:
             raise ValueError(f"mass_kg: {problem}, write {self.mass_kg * 1000:g}")
 
     def sensor(self, name: str) -> SensorConfig | None:
-        """The sensor of that name."""
+        """The sensor of that name, or None."""
         return next((s for s in self.sensors if s.name == name), None)
 
 
 def parse_machine(table: Mapping[str, Any], sensors: tuple[SensorConfig, ...], where: str) -> MachineConfig:
-    """Build a machine from its TOML table and its sensors."""
+    """A machine from its TOML table and sensors."""
     try:
         return replace(from_table(MachineConfig, table, f"{where} [machine]"), sensors=sensors)
     except ValueError as error:
@@ -221,7 +214,7 @@ def parse_machine(table: Mapping[str, Any], sensors: tuple[SensorConfig, ...], w
 
 
 def sensor_lines(sensor: SensorConfig) -> list[str]:
-    """The keys of one sensor as TOML."""
+    """A sensor's keys as TOML."""
     xyz_m, rpy_deg = ([float(v) for v in values] for values in (sensor.mount.xyz_m, sensor.mount.rpy_deg))
     std = ", ".join(f"{name} = {float(value)}" for name, value in sensor.std.items())
     table = f"std = {{ {std} }}" if std else "std = {}"
@@ -229,7 +222,7 @@ def sensor_lines(sensor: SensorConfig) -> list[str]:
 
 
 def machine_toml(machine: MachineConfig) -> str:
-    """A machine and its sensors as TOML, as an agent's configuration has them; drag and friction where known."""
+    """A machine and its sensors as agent TOML; drag and friction if known."""
     unknown = {name for name in ("drag_area_m2", "drive_friction_n") if not getattr(machine, name)}
     known = [line for line in plain_lines(machine) if line.partition(" ")[0] not in unknown]
     lines = ["[machine]", *known, *powertrain_lines(machine)]
@@ -239,13 +232,13 @@ def machine_toml(machine: MachineConfig) -> str:
 
 
 def powertrain_lines(machine: MachineConfig) -> list[str]:
-    """The powertrain of a machine as a key of its table, where it has one."""
+    """The powertrain key, if any."""
     values = asdict(machine.powertrain) if machine.powertrain else {}
     return [f"powertrain = {{ {', '.join(toml_lines(values))} }}"] if values else []
 
 
 def plain_lines(config: Any) -> list[str]:
-    """The plain values of a dataclass as TOML keys."""
+    """A dataclass's plain values as TOML keys."""
     values = {f.name: getattr(config, f.name) for f in fields(config)}
     plain = {name: value for name, value in values.items() if isinstance(value, bool | int | float | str)}
     names = {name: list(value) for name, value in values.items() if name == "measures"}

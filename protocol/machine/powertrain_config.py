@@ -1,4 +1,4 @@
-"""What lies between engine or motor and the wheels: [machine.powertrain], where torque is not read at the wheels."""
+"""[machine.powertrain]: between engine or motor and the wheels, where torque is not read."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -8,12 +8,12 @@ from protocol.config import require_between
 
 @dataclass(frozen=True)
 class PowertrainConfig:
-    """Powertrain of a machine, as its data sheets state it.
+    """A powertrain by data sheet.
 
-    reference_torque_nm: what 100 % torque of the engine is (SPN 544). losses: friction and auxiliary drives, as a share
-    of it, where no reading states them. gears, reverse_gears: turns of engine or motor per turn of the gearbox's
-    output; final_drive: of those per turn of a wheel, axles and hubs together. efficiency: from engine or motor to the
-    wheels. idle_pressure_pa: of hydraulics that the engine drives; above it they draw an unknown share. 0: it has none.
+    reference_torque_nm: 100 % engine torque (SPN 544). losses: friction and auxiliary drives, as a share of it, if not
+    read. gears, reverse_gears: engine or motor turns per gearbox output turn; final_drive: output turns per wheel turn,
+    axles and hubs together. efficiency: engine or motor to wheels. idle_pressure_pa: of engine-driven hydraulics; above
+    it their share is unknown. 0: none.
     """
 
     reference_torque_nm: float = 0.0
@@ -39,7 +39,7 @@ class PowertrainConfig:
             raise ValueError("gears: none; a machine without a gearbox has one, [1.0]")
 
     def lacks(self, kinds: Collection[str]) -> str:
-        """What sensors of these kinds need of it and it does not state, in a sentence; empty where all is there."""
+        """What sensors of these kinds need and it lacks, as a sentence, or ""."""
         if "engine" in kinds and not self.reference_torque_nm:
             return "reference_torque_nm: an engine states its torque as a share of it: its plate or data sheet has it"
         if "motor" in kinds and len(self.gears) > 1:

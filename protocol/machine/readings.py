@@ -1,7 +1,7 @@
-"""Readings of sensors: the only input of an agent, from the simulation, from replayed logs and from real drivers.
+"""Sensor readings: an agent's only input, from simulation, replay or drivers.
 
-Each kind is a flat frozen dataclass whose fields are also the columns of log folders and of sensor bundles; the
-suffix of a field is its unit. Values are raw: in the sensor's own frame, before any correction.
+Each kind is a flat frozen dataclass; its fields are the columns of log folders and bundles, with units as suffixes.
+Values are raw, in the sensor's frame.
 """
 
 import math
@@ -10,12 +10,12 @@ from typing import ClassVar
 
 from protocol.errors import MessageError, Refusal
 
-MAX_STAMP_NS = 4_102_444_800_000_000_000  # the year 2100
+MAX_STAMP_NS = 4_102_444_800_000_000_000  # year 2100
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One reading of one sensor. stamp_ns: UTC nanoseconds at which the quantity was true."""
+    """A sensor reading. stamp_ns: UTC nanoseconds at which the quantity was true."""
 
     kind: ClassVar[str] = ""
     limits: ClassVar[dict[str, tuple[float, float]]] = {}
@@ -26,7 +26,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Gps(Reading):
-    """A fix of one antenna, WGS 84, with the variances that the receiver states."""
+    """An antenna's fix, WGS 84, with stated variances."""
 
     kind: ClassVar[str] = "gps"
     limits: ClassVar[dict[str, tuple[float, float]]] = {
@@ -46,7 +46,7 @@ class Gps(Reading):
 
 @dataclass(frozen=True, slots=True)
 class GpsVelocity(Reading):
-    """Velocity of one antenna east and north, by the Doppler shift of the signals, with the variances stated."""
+    """Doppler velocity of an antenna east and north, with stated variances."""
 
     kind: ClassVar[str] = "gps_velocity"
     limits: ClassVar[dict[str, tuple[float, float]]] = {
@@ -62,7 +62,7 @@ class GpsVelocity(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Imu(Reading):
-    """Angular rate and specific force (gravity included: +9.8 on the axis that points up at rest)."""
+    """Angular rate and specific force (+9.8 on the upward axis at rest)."""
 
     kind: ClassVar[str] = "imu"
     limits: ClassVar[dict[str, tuple[float, float]]] = {
@@ -80,7 +80,7 @@ class Imu(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Attitude(Reading):
-    """Orientation `map_from_sensor` as a unit quaternion, from an attitude and heading reference."""
+    """Orientation `map_from_sensor` of a reference, as a unit quaternion."""
 
     kind: ClassVar[str] = "attitude"
     limits: ClassVar[dict[str, tuple[float, float]]] = {
@@ -99,7 +99,7 @@ class Attitude(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Odometry(Reading):
-    """Velocity of the machine's own frame as its controller reports it."""
+    """Velocity of the machine's frame by its controller."""
 
     kind: ClassVar[str] = "odometry"
     limits: ClassVar[dict[str, tuple[float, float]]] = {
@@ -114,7 +114,7 @@ class Odometry(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Encoder(Reading):
-    """Tick counts of the two wheels of one axle, counted up from start, down in reverse."""
+    """Tick counts of an axle's two wheels, down in reverse."""
 
     kind: ClassVar[str] = "encoder"
     limits: ClassVar[dict[str, tuple[float, float]]] = dict.fromkeys(("left_ticks", "right_ticks"), (-1e15, 1e15))
@@ -123,12 +123,12 @@ class Encoder(Reading):
     right_ticks: float
 
 
-WheelReading = Encoder | Odometry  # of sensors that show how far the wheels rolled
+WheelReading = Encoder | Odometry  # sensors of wheel roll
 
 
 @dataclass(frozen=True, slots=True)
 class Torque(Reading):
-    """Drive torque at the wheels, summed over all of them, positive when it drives forwards."""
+    """Drive torque at all wheels, positive forwards."""
 
     kind: ClassVar[str] = "torque"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"torque_nm": (-1e7, 1e7)}
@@ -138,7 +138,7 @@ class Torque(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Engine(Reading):
-    """Indicated torque of an engine, friction included, as a share of its reference torque, and its speed."""
+    """Indicated engine torque, friction included, as a share of the reference torque, and speed."""
 
     kind: ClassVar[str] = "engine"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"torque": (-1.25, 1.5), "speed_radps": (0, 1000)}
@@ -149,7 +149,7 @@ class Engine(Reading):
 
 @dataclass(frozen=True, slots=True)
 class EngineLosses(Reading):
-    """Friction of an engine and its auxiliary drives, as a share of its reference torque."""
+    """Engine friction and auxiliary drives, as a share of the reference torque."""
 
     kind: ClassVar[str] = "engine_losses"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"friction": (-1.25, 1.5)}
@@ -159,7 +159,7 @@ class EngineLosses(Reading):
 
 @dataclass(frozen=True, slots=True)
 class FuelRate(Reading):
-    """Diesel that an engine burns, in litres per hour."""
+    """Diesel per hour."""
 
     kind: ClassVar[str] = "fuel_rate"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"litres_ph": (0, 3300)}
@@ -169,7 +169,7 @@ class FuelRate(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Driveline(Reading):
-    """Whether the clutch is closed, the converter locked, and a gear being changed: 0 or 1 each."""
+    """Clutch closed, converter locked, gear changing: 0 or 1 each."""
 
     kind: ClassVar[str] = "driveline"
     limits: ClassVar[dict[str, tuple[float, float]]] = dict.fromkeys(("engaged", "locked", "shifting"), (0.0, 1.0))
@@ -181,7 +181,7 @@ class Driveline(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Motor(Reading):
-    """Torque of an electric or hydraulic motor at its shaft, summed over all, positive when it drives forwards."""
+    """Shaft torque of electric or hydraulic motors, summed, positive forwards."""
 
     kind: ClassVar[str] = "motor"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"torque_nm": (-1e6, 1e6)}
@@ -191,7 +191,7 @@ class Motor(Reading):
 
 @dataclass(frozen=True, slots=True)
 class MotorPower(Reading):
-    """Mechanical power of the motors that drive, negative when they brake."""
+    """Mechanical power of drive motors, negative in braking."""
 
     kind: ClassVar[str] = "motor_power"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"power_w": (-1e7, 1e7)}
@@ -201,7 +201,7 @@ class MotorPower(Reading):
 
 @dataclass(frozen=True, slots=True)
 class HydraulicPressure(Reading):
-    """Pressure of the hydraulics that the engine drives beside the wheels."""
+    """Pressure of hydraulics that the engine drives beside the wheels."""
 
     kind: ClassVar[str] = "hydraulic_pressure"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"pressure_pa": (-1e6, 2e8)}
@@ -211,7 +211,7 @@ class HydraulicPressure(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Brake(Reading):
-    """How much of a brake or retarder is applied, which the torque does not see; of a switch 0 or 1."""
+    """Applied share of a brake or retarder, unseen by the torque; 0 or 1 of a switch."""
 
     kind: ClassVar[str] = "brake"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"applied": (0, 1)}
@@ -221,7 +221,7 @@ class Brake(Reading):
 
 @dataclass(frozen=True, slots=True)
 class BrakeForce(Reading):
-    """Force of brakes or a retarder at the wheels, which the torque does not see, whatever the direction of travel."""
+    """Brake or retarder force at the wheels, unseen by the torque, in any direction of travel."""
 
     kind: ClassVar[str] = "brake_force"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"force_n": (0, 1e7)}
@@ -231,7 +231,7 @@ class BrakeForce(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Articulation(Reading):
-    """Angle of the front frame against the rear frame, positive to the left."""
+    """Angle of front against rear frame, positive left."""
 
     kind: ClassVar[str] = "articulation"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"angle_rad": (-math.pi, math.pi)}
@@ -241,7 +241,7 @@ class Articulation(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Payload(Reading):
-    """What the machine carries, as its weighing system states it."""
+    """Load by the weighing system."""
 
     kind: ClassVar[str] = "payload"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"payload_kg": (0, 500_000)}
@@ -251,7 +251,7 @@ class Payload(Reading):
 
 @dataclass(frozen=True, slots=True)
 class Steering(Reading):
-    """Angle of the front wheels against straight ahead, as of one in the middle, positive to the left."""
+    """Angle of a front wheel in the middle, positive left."""
 
     kind: ClassVar[str] = "steering"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"angle_rad": (-1.5, 1.5)}  # across there is no turn rate
@@ -286,12 +286,12 @@ KINDS: dict[str, type[Reading]] = {
 
 
 def columns(kind: str) -> tuple[str, ...]:
-    """Value columns of a kind, in the order of its fields, without sensor and stamp."""
+    """Value columns of a kind, in field order."""
     return tuple(f.name for f in fields(KINDS[kind]))[2:]
 
 
 def parse_reading(kind: str, sensor: str, stamp_ns: int, values: tuple[float, ...]) -> Reading:
-    """Build a reading; a MessageError names the first value that is not finite or out of range."""
+    """Build a reading; MessageError names the first value not finite or out of range."""
     cls = KINDS[kind]
     if not 0 < stamp_ns <= MAX_STAMP_NS:
         raise MessageError(Refusal.OUT_OF_RANGE, f"{stamp_ns} is not a UTC stamp in ns", field=f"{sensor}.stamp_ns")

@@ -1,4 +1,4 @@
-"""Readings in recordings, exact to the bit, in the order in which an agent took them."""
+"""Recorded readings, bit-exact, in the agent's order."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from protocol.recording import Message, RecordedFile, Recording, time_of
 from protocol.site.site_config import NAME
 
 LOCATION_FIX = "foxglove.LocationFix"
-PREFIX = "sitegrid."  # of schemas of other kinds
+PREFIX = "sitegrid."  # of other schemas
 TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
 NUMBER, TEXT = {"type": "number"}, {"type": "string"}
 FIX_PROPERTIES: dict[str, Any] = {
@@ -23,8 +23,8 @@ FIX_PROPERTIES: dict[str, Any] = {
     "position_covariance": {"type": "array", "items": NUMBER},
     "position_covariance_type": {"type": "integer"},
 }
-DIAGONAL = slice(None, None, 4)  # of a matrix of 3 x 3, row by row
-COVARIANCE_DIAGONAL = 2  # Foxglove's name for a covariance of which the diagonal is known
+DIAGONAL = slice(None, None, 4)  # of a 3 x 3 matrix, row by row
+COVARIANCE_DIAGONAL = 2  # Foxglove's code for a known diagonal
 COLUMNS = {kind: columns(kind) for kind in KINDS}
 SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     kind: (PREFIX + kind, {"timestamp": TIME, **dict.fromkeys(names, NUMBER)}) for kind, names in COLUMNS.items()
@@ -32,7 +32,7 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 class RecordedReading(NamedTuple):
-    """A reading of a machine. log_ns: when its agent took it, by the clock of its host."""
+    """A machine's reading. log_ns: when its agent took it, by the host clock."""
 
     machine: str
     log_ns: int
@@ -58,7 +58,7 @@ def _values_of(reading: Reading) -> dict[str, Any]:
 def fix_of(
     frame: str, place: tuple[float, float, float], covariance: tuple[float, ...], covariance_type: int
 ) -> dict[str, Any]:
-    """A place as Foxglove's LocationFix. place: latitude, longitude [deg], height [m]. covariance: (9,) [m2]."""
+    """A Foxglove LocationFix. place: latitude, longitude [deg], height [m]. covariance: (9,) [m2]."""
     named = dict(zip(("latitude", "longitude", "altitude"), place, strict=True))
     return {
         "frame_id": frame,
@@ -69,7 +69,7 @@ def fix_of(
 
 
 def readings_of(file: RecordedFile | Path) -> Iterator[RecordedReading]:
-    """Readings of all machines in a recording; other messages are passed over. ConfigError where it is damaged."""
+    """Readings of all machines in a recording; other messages are skipped. ConfigError if damaged."""
     recorded = file if isinstance(file, RecordedFile) else RecordedFile(file)
     for message in recorded.messages():
         if reading := reading_of(message, recorded.path):
@@ -77,7 +77,7 @@ def readings_of(file: RecordedFile | Path) -> Iterator[RecordedReading]:
 
 
 def reading_of(message: Message, path: Path) -> RecordedReading | None:
-    """The reading that a message is, None where it is none; ConfigError, with the file, where it is damaged."""
+    """A message's reading, or None; ConfigError, with the file, if damaged."""
     _, *words = message.topic.split("/")
     kind = Gps.kind if message.schema == LOCATION_FIX else message.schema.removeprefix(PREFIX)
     if len(words) != 4 or words[::2] != ["machine", "readings"] or kind not in KINDS:

@@ -1,4 +1,4 @@
-"""Samples: geotagged resistance and gradient, as structured rows; the same bytes on machine, wire and server."""
+"""Samples: located resistance and gradient as structured rows, the same bytes on machine, wire and server."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ from protocol.arrays import AnyArray, Bools, Table
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
 
-# Order, types and names are part of the wire (docs/protocol.md). Little-endian.
+# Order, types, names: part of the wire (docs/protocol.md), little-endian.
 SAMPLE_DTYPE = np.dtype(
     [
         ("stamp_ns", "<i8"),
@@ -34,18 +34,18 @@ SAMPLE_DTYPE = np.dtype(
     ]
 )
 COLUMNS: tuple[str, ...] = SAMPLE_DTYPE.names or ()
-RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records field by field, and these at once
+RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # copied at once, while numpy copies records by field
 
 COVARIANCES = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
 RESISTANCE = ("c_rr", "c_rr_var")  # may both be NaN
 GRADE = ("grade_e", "grade_n", "grade_var")  # may all be NaN
-APPLIED = ("applied_zero", "applied_scale")  # what the machine's own calibration has taken off its balance already
-MASS = "mass_kg"  # of machine and load; may be NaN
-AIDED = "aid_share"  # how much of the place came from lanes of the map [-]
-FUEL = "fuel_l"  # litres of diesel burned while it moved, since the sample before; may be NaN
-# Columns that a batch may lack, and what stands for them: nothing was taken off; mass and fuel are not known; no lanes.
+APPLIED = ("applied_zero", "applied_scale")  # taken off the balance by the machine's own calibration
+MASS = "mass_kg"  # with load; may be NaN
+AIDED = "aid_share"  # share of the place that came from lanes [-]
+FUEL = "fuel_l"  # litres of diesel since the last sample, while moving; may be NaN
+# Optional columns of a batch, and their defaults.
 OPTIONAL = {**dict.fromkeys(APPLIED, 0.0), MASS: np.nan, AIDED: 0.0, FUEL: np.nan}
-NAN_ALLOWED = (RESISTANCE, GRADE, (MASS,), (FUEL,))  # groups of columns: NaN together, or not at all
+NAN_ALLOWED = (RESISTANCE, GRADE, (MASS,), (FUEL,))  # groups that are NaN together or not at all
 
 # Plausible range of each column.
 LIMITS: dict[str, tuple[float, float]] = {
@@ -61,34 +61,33 @@ LIMITS: dict[str, tuple[float, float]] = {
     "grade_e": (-5.0, 5.0),
     "grade_n": (-5.0, 5.0),
     "grade_var": (0.0, 100.0),
-    # No accelerometer or drive train that a machine is driven with is further off. An IMU that nobody calibrated, under
-    # a frame of a machine, has a zero of 0.03 and stands 0.026 rad (1.5 degrees) askew: five times both together.
+    # Beyond any usable accelerometer or drive train. An uncalibrated IMU under a frame has a bias of 0.03 and is tilted
+    # 0.026 rad (1.5 degrees): five times both.
     "applied_zero": (-0.2, 0.2),
     "applied_scale": (-0.5, 0.5),
     "mass_kg": (1.0, 1e6),
     "aid_share": (0.0, 1.0),
     "fuel_l": (0.0, 100.0),
 }
-# What machines differ by before any calibration, by data sheets, as machines and map server assume: standard deviations
-# of an accelerometer's zero over gravity (0.044 m/s2) and of the scale of drive force over weight; random walk of the
-# zero [1/sqrt(s)], by which it is as unsure as at first after an hour.
+# Standard deviations before calibration, by data sheets: accelerometer bias over gravity (0.044 m/s2), scale of drive
+# force over weight; and the bias's random walk [1/sqrt(s)], its initial deviation in an hour.
 ZERO_STD, SCALE_STD, ZERO_WALK = 0.0045, 0.045, 8e-5
 
 
 def empty(n: int = 0) -> Table:
-    """Return `n` samples of zeros, of no known mass and fuel."""
+    """`n` samples of zeros, with mass and fuel unknown."""
     rows = np.zeros(n, SAMPLE_DTYPE)
     rows[MASS] = rows[FUEL] = np.nan
     return rows
 
 
 def joined(tables: Sequence[Table]) -> Table:
-    """Samples of several tables in one."""
+    """Several tables in one."""
     return np.concatenate([np.empty(0, RAW_SAMPLE), *(table.view(RAW_SAMPLE) for table in tables)]).view(SAMPLE_DTYPE)
 
 
 def content_hash(row: Table) -> str:
-    """Hash of one sample's exact bytes, for audits."""
+    """Hash of a sample's bytes, for audits."""
     return hashlib.blake2b(row.tobytes(), digest_size=8).hexdigest()
 
 
@@ -96,17 +95,16 @@ Columns = Table | Mapping[str, AnyArray]
 
 
 def check_samples(rows: Columns, extent_m: float) -> None:
-    """Raise a MessageError that names field and row if any sample is not plausible.
+    """MessageError with field and row for an implausible sample.
 
-    rows: samples, or some of their columns: COVARIANCES and groups of NAN_ALLOWED all together or not at all. extent_m:
-    positions further than this from the site's origin, east or north, are refused.
+    rows: samples, or some columns, with COVARIANCES and groups of NAN_ALLOWED complete. extent_m: bound of positions.
     """
     names = rows.keys() if isinstance(rows, Mapping) else COLUMNS
     _check_finite(rows, [name for name in COLUMNS if name in names])
     for name in ("x_m", "y_m"):
         _refuse(np.abs(rows[name]) > extent_m, rows, name, Refusal.OUTSIDE_SITE, f"beyond {extent_m:g} m of the origin")
     for name, (low, high) in ((name, ends) for name, ends in LIMITS.items() if name in names):
-        bad: Bools = (rows[name] < low) | (rows[name] > high)  # NaN passes here: it was checked above
+        bad: Bools = (rows[name] < low) | (rows[name] > high)  # NaN passes: checked above
         reason = Refusal.COVARIANCE if name.startswith("cov_") else Refusal.OUT_OF_RANGE
         _refuse(bad, rows, name, reason, f"not between {low:g} and {high:g}")
     if COVARIANCES[0] in names:

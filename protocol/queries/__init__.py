@@ -1,1 +1,1 @@
-"""Map queries and commands: what is asked, and what is answered."""
+"""Map queries and commands, with their answers."""

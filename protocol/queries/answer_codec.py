@@ -1,6 +1,6 @@
-"""Answers to map queries, to MessagePack and back (docs/protocol.md, "Map queries").
+"""Answers of map queries to MessagePack and back (docs/protocol.md, "Map queries").
 
-Reading ignores fields that it does not know, and refuses an answer without one that it does: a MessageError names it.
+Unknown fields are ignored; a missing one is a MessageError that names it.
 """
 
 import functools
@@ -18,11 +18,11 @@ from protocol.queries import answers
 from protocol.site.geometry import MAX_CELLS
 from protocol.wire.fields import MAX_SMALL_BYTES, check_plain, pack, take, take_store, unpack
 
-MAX_REPLY_BYTES = 2**23  # a piece has 0.8 MB, a history of 2000 spans 1 MB
-MAX_CHANGES = 1000  # of one answer
+MAX_REPLY_BYTES = 2**23  # a piece has 0.8 MB, 2000 spans 1 MB
+MAX_CHANGES = 1000  # per answer
 MAX_CELL_M = 1e4
 MAX_PLACE_M = 1e7  # from the origin
-MAX_ITEMS = 100_000  # of one list
+MAX_ITEMS = 100_000  # per list
 T = TypeVar("T")
 _hints = functools.cache(typing.get_type_hints)
 
@@ -31,7 +31,7 @@ _hints = functools.cache(typing.get_type_hints)
 
 
 def encode_point(answer: answers.PointAnswer) -> bytes:
-    """Answer of `point`."""
+    """Answer `point`."""
     place = {"x_m": answer.x_m, "y_m": answer.y_m}
     return pack(
         {**place, "values": _plain(answer.values), **encode_version(answer.version), "stamp_ns": answer.stamp_ns}
@@ -46,7 +46,7 @@ def decode_point(data: bytes) -> answers.PointAnswer:
 
 
 def encode_points(answer: answers.PointsAnswer) -> bytes:
-    """Answer of `points`: centres as float64, layers as float32, little-endian."""
+    """Answer `points`: centres as float64, layers as float32, little-endian."""
     place = {name: np.ascontiguousarray(getattr(answer, name), "<f8").tobytes() for name in ("x_m", "y_m")}
     layers = {name: np.ascontiguousarray(values, "<f4").tobytes() for name, values in answer.layers.items()}
     return pack({**place, "layers": layers, **encode_version(answer.version), "stamp_ns": answer.stamp_ns})
@@ -64,7 +64,7 @@ def decode_points(data: bytes) -> answers.PointsAnswer:
 
 
 def take_column(table: dict[str, Any], name: str) -> Floats:
-    """Take the field `name` as numbers (n,), float64 little-endian; at least one."""
+    """Take a field as numbers (n,), float64 little-endian; at least one."""
     data: bytes = take(table, name, bytes)
     if not data or len(data) % 8:
         raise MessageError(Refusal.COLUMN_LENGTH, f"{len(data)} bytes are no numbers of 8", field=name)
@@ -72,7 +72,7 @@ def take_column(table: dict[str, Any], name: str) -> Floats:
 
 
 def encode_region(region: answers.Region) -> bytes:
-    """Answer of `region` and `piece`: layers as float32 little-endian, row by row from the south."""
+    """Answer of `region` and `piece`: float32 little-endian, rows from the south."""
     layers = {name: np.ascontiguousarray(values, "<f4").tobytes() for name, values in region.layers.items()}
     return pack(
         {
@@ -95,7 +95,7 @@ def decode_region(data: bytes) -> answers.Region:
     cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
     if not (0 < cell_m <= MAX_CELL_M and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{columns} x {rows} cells of {cell_m} m", field="columns, rows")
-    if not (tables := take(table, "layers", dict)):  # what is in them proves the number of cells
+    if not (tables := take(table, "layers", dict)):  # their size proves the number of cells
         raise MessageError(Refusal.MISSING_FIELD, "empty", field="layers")
     layers = {name: _decode_layer(tables, name, rows, columns) for name in tables}
     west_m, south_m = (_take_place(table, name) for name in ("west_m", "south_m"))
@@ -111,7 +111,7 @@ def decode_region(data: bytes) -> answers.Region:
 
 
 def _take_piece(table: dict[str, Any], columns: int, rows: int) -> answers.Piece | None:
-    """Where a piece of columns x rows cells lies, if that is said; it has to lie within its region."""
+    """The place of a piece, if stated."""
     if table.get("piece") is None:
         return None
     piece = take_record(answers.Piece, table, "piece")
@@ -137,7 +137,7 @@ def _decode_layer(layers: dict[str, Any], name: str, rows: int, columns: int) ->
 
 
 def encode_history(answer: answers.HistoryAnswer) -> bytes:
-    """Answer of `history`."""
+    """Answer `history`."""
     spans = [{"first_ns": s.first_ns, "last_ns": s.last_ns, "values": _plain(s.values)} for s in answer.spans]
     place = {"x_m": answer.x_m, "y_m": answer.y_m}
     return pack({**place, "spans": spans, **encode_version(answer.version), "stamp_ns": answer.stamp_ns})
@@ -155,7 +155,7 @@ def decode_history(data: bytes) -> answers.HistoryAnswer:
 
 
 def encode_version(version: answers.MapVersion) -> dict[str, Any]:
-    """The fields of an answer that say which map it is true for."""
+    """Version fields of an answer."""
     return {"store": version.store, "merged": version.row, "fact": version.fact}
 
 
@@ -171,7 +171,7 @@ def _plain(values: Mapping[str, float]) -> dict[str, float]:
 def _take_values(table: dict[str, Any]) -> dict[str, float]:
     values: dict[str, float] = take(table, "values", dict)
     for name, value in values.items():
-        if type(name) is not str or type(value) is not float:  # NaN is unknown, so `take` would be too strict
+        if type(name) is not str or type(value) is not float:  # NaN is unknown; `take` would refuse it
             raise MessageError(Refusal.WRONG_TYPE, "a number is expected", field=f"values.{name!s:.40}")
     return values
 
@@ -188,7 +188,7 @@ def _take_tables(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def encode_alive(alive: answers.ServerAlive) -> bytes:
-    """Answer of `alive`."""
+    """Answer `alive`."""
     return pack(asdict(alive))
 
 
@@ -200,7 +200,7 @@ def decode_alive(data: bytes) -> answers.ServerAlive:
 
 
 def encode_info(info: answers.MapInfo | Mapping[str, Any]) -> bytes:
-    """Answer of `info`; here and below, a record or a table of its fields."""
+    """Answer of `info`; here and below, of a record or a table."""
     return pack({"info": _table(info)})
 
 
@@ -210,7 +210,7 @@ def decode_info(data: bytes) -> answers.MapInfo:
 
 
 def encode_machines(answer: answers.MachinesAnswer) -> bytes:
-    """Answer of `machines`."""
+    """Answer `machines`."""
     return pack({"machines": [_table(machine) for machine in answer.machines], **encode_version(answer.version)})
 
 
@@ -220,7 +220,7 @@ def decode_machines(data: bytes) -> answers.MachinesAnswer:
 
 
 def encode_machine(machine: answers.TrustAnswer | Mapping[str, Any]) -> bytes:
-    """Answer to a command about one machine."""
+    """Answer to a command on a machine."""
     return pack({"machine": _table(machine)})
 
 
@@ -230,7 +230,7 @@ def decode_machine(data: bytes) -> answers.TrustAnswer:
 
 
 def encode_changes(answer: answers.ChangesAnswer) -> bytes:
-    """Answer of `changes`."""
+    """Answer `changes`."""
     return pack({"changes": [_table(change) for change in answer.changes], **encode_version(answer.version)})
 
 
@@ -240,7 +240,7 @@ def decode_changes(data: bytes) -> answers.ChangesAnswer:
 
 
 def encode_change(change: answers.GroundChange | Mapping[str, Any]) -> bytes:
-    """The event that an area changed, put on `map/changed`."""
+    """Event of a changed area, on `map/changed`."""
     return pack({"change": _table(change)})
 
 
@@ -254,7 +254,7 @@ def _table(record: Any) -> dict[str, Any]:
 
 
 def take_record(cls: type[T], table: dict[str, Any], name: str) -> T:
-    """Take the field `name` as a record."""
+    """Take a field as a record."""
     record: T = _value(cls, take(table, name, dict), name)
     return record
 
@@ -266,7 +266,7 @@ def _take_records(cls: type[T], data: bytes, name: str) -> tuple[tuple[T, ...], 
 
 
 def _value(hint: Any, value: Any, field: str) -> Any:
-    """A plain value as its type hint says; `field` is its place in the answer."""
+    """A plain value as its hint demands; field: its place."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is types.UnionType:
         return None if value is None else _value(arguments[0], value, field)
@@ -313,7 +313,7 @@ def _tuple(hints: tuple[Any, ...], values: list[Any], field: str) -> tuple[Any, 
 
 
 def encode_error(error: QueryError) -> bytes:
-    """Answer to a query or a command that is refused."""
+    """Answer to a refused query or command."""
     again = {"retry_after_s": error.retry_after_s} if error.retry_after_s else {}
     return pack({"reason": error.reason, "problem": str(error), **again})
 

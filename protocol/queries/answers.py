@@ -1,7 +1,7 @@
-"""Answers to map queries as values (docs/protocol.md, "Map queries"); their bytes: `answer_codec.py`.
+"""Answers of map queries as values (docs/protocol.md, "Map queries"); bytes: `answer_codec.py`.
 
-Stamps are UTC in nanoseconds. `version` is the version of the map that an answer is true for, `merged` its journal row;
-`stamp_ns` is the site's now, or the time that the map is as of.
+Stamps are UTC nanoseconds. `version`: of the map, `merged`: its journal row; `stamp_ns`: the site's now, or the map's
+time.
 """
 
 from collections.abc import Mapping
@@ -17,10 +17,7 @@ from protocol.site.site_config import KnownGround
 
 @dataclass(frozen=True)
 class MapVersion:
-    """A map that anybody can make again. store: id of the store; row: its last journal row that is in the map.
-
-    fact: number of the last fact that is, 0 for none; a fact is a decision about a machine.
-    """
+    """A reproducible map. store: id of the store; row: last merged journal row; fact: last decision in it, or 0."""
 
     store: str
     row: int
@@ -28,19 +25,19 @@ class MapVersion:
 
 
 class _OfVersion:
-    """An answer that is true for one version of the map."""
+    """An answer of one map version."""
 
     version: MapVersion
 
     @property
     def merged(self) -> int:
-        """The last journal row in the map."""
+        """Last merged journal row."""
         return self.version.row
 
 
 @dataclass(frozen=True)
 class PointAnswer(_OfVersion):
-    """Layer values of the cell with centre (x_m, y_m); NaN is unknown."""
+    """Layers of the cell with centre (x_m, y_m); NaN is unknown."""
 
     x_m: float
     y_m: float
@@ -51,7 +48,7 @@ class PointAnswer(_OfVersion):
 
 @dataclass(frozen=True, repr=False)
 class PointsAnswer(_OfVersion):
-    """Layers of n cells: x_m, y_m (n,) their centres; layers: name -> float32 (n,), NaN where unknown."""
+    """Layers of n cells: x_m, y_m (n,): centres; layers: name -> float32 (n,), NaN if unknown."""
 
     x_m: Floats
     y_m: Floats
@@ -68,10 +65,10 @@ class PointsAnswer(_OfVersion):
 
 @dataclass(frozen=True)
 class Piece:
-    """Where a piece lies in the region that was asked for.
+    """A piece's place in its region.
 
-    cursor: names the version of the map that the region is read from. number: of this piece, 0 to count - 1. column,
-    row: its south-western cell in the region, which has columns x rows cells.
+    cursor: of the region's map version. number: 0 to count - 1. column, row: south-western cell in the region of
+    columns x rows cells.
     """
 
     cursor: int
@@ -87,8 +84,8 @@ class Piece:
 class Region(_OfVersion):
     """A rectangle of cells.
 
-    x_m (columns,), y_m (rows,): cell centres in `map`, growing east and north. layers: name -> float32 (rows, columns),
-    NaN where unknown; row 0 is the southernmost. piece: where this is a piece of a larger region; None for all of it.
+    x_m (columns,), y_m (rows,): centres in `map`, growing east and north. layers: name -> float32 (rows, columns),
+    southernmost row first, NaN if unknown. piece: None for a whole region.
     """
 
     x_m: Floats
@@ -118,7 +115,7 @@ class Region(_OfVersion):
 
 @dataclass(frozen=True)
 class HistorySpan:
-    """Layer values of one cell from its samples with first_ns <= stamp <= last_ns alone; NaN is unknown."""
+    """Layers of a cell from samples with first_ns <= stamp <= last_ns; NaN is unknown."""
 
     first_ns: int
     last_ns: int
@@ -127,7 +124,7 @@ class HistorySpan:
 
 @dataclass(frozen=True)
 class HistoryAnswer(_OfVersion):
-    """The cell with centre (x_m, y_m) over time, oldest first; a span without samples is not there."""
+    """The cell with centre (x_m, y_m) over time, oldest first, without empty spans."""
 
     x_m: float
     y_m: float
@@ -138,7 +135,7 @@ class HistoryAnswer(_OfVersion):
 
 @dataclass(frozen=True)
 class SiteInfo:
-    """The site as its map server has it: `SiteConfig`, with the digits and the PROJ string of its frame."""
+    """The server's `SiteConfig`, with frame id and PROJ string."""
 
     name: str
     origin_lat_deg: float
@@ -155,9 +152,9 @@ class SiteInfo:
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """What one machine sent: spools, samples accepted, samples that it declared lost, and its newest stamp.
+    """A machine's counts: spools, accepted samples, declared losses, newest stamp.
 
-    missing: samples that were acknowledged, are gone, and that it has neither sent again nor declared lost since.
+    missing: acknowledged samples that are gone, neither sent again nor declared lost.
     """
 
     spools: int
@@ -169,10 +166,10 @@ class SampleCounts:
 
 @dataclass(frozen=True)
 class CheckpointCounts:
-    """Checkpoints of the evidence, from which maps of the past are made.
+    """Checkpoints, from which maps of the past are made.
 
-    count: of those that can be used. bytes: of all. newest_ns: when the newest one that can be used is closed, 0 for
-    none. passed_over: how many were damaged since the start.
+    count: usable ones. bytes: of all. newest_ns: end of the newest usable one, or 0. passed_over: damaged since the
+    start.
     """
 
     count: int
@@ -183,7 +180,7 @@ class CheckpointCounts:
 
 @dataclass(frozen=True)
 class ServerProcess:
-    """Where a map server runs."""
+    """Process of a map server."""
 
     host: str
     pid: int
@@ -191,16 +188,15 @@ class ServerProcess:
 
 @dataclass(frozen=True)
 class MapInfo:
-    """State of the map and its server.
+    """State of map and server.
 
-    store: its id; descends: ids of the stores that it was folded from; accepted: ids of those whose place a person let
-    it take; epoch: number of its server among all that ever wrote it; replica: what stands behind its disk:
-    "synchronous", "asynchronous" or "none". fact: see MapVersion; decided: number of the last decision about a machine
-    that there is: the map is folded again for it where it is beyond `fact`; corrections: how many stretches of samples
-    have one. journalled, merged, snapshot: journal rows. bounds: first column, first row, end column and end row of the
-    blocks with evidence; None without any. first_ns, stamp_ns: the map's oldest stamp, and the site's now; 0 without
-    any. wall_ns: the server's clock. distrusted: machines whose samples are excluded. boundaries: of the classes of
-    resistance. shortfalls: what the journal lacked of what was acknowledged, one line for each start that noticed.
+    store: its id; descends: stores it was folded from; accepted: stores a person let it replace; epoch: of its server
+    among all its writers; replica: of its disk, "synchronous", "asynchronous" or "none". fact: see MapVersion; decided:
+    last decision about a machine; beyond `fact`, the map is being folded again; corrections: number of corrected spans.
+    journalled, merged, snapshot: journal rows. bounds: first column, first row, end column, end row of blocks with
+    evidence, or None. first_ns, stamp_ns: oldest stamp, and the site's now; or 0. wall_ns: the server's clock.
+    distrusted: excluded machines. boundaries: of resistance classes. shortfalls: acknowledged rows the journal lacked,
+    a line per start.
     """
 
     site: SiteInfo
@@ -235,10 +231,7 @@ class MapInfo:
 
 @dataclass(frozen=True)
 class ServerAlive:
-    """A map server that takes batches. journalled, merged: journal rows.
-
-    busy_s: how long it has been at the work that it does now, 0 for none.
-    """
+    """A map server that takes batches. journalled, merged: journal rows. busy_s: age of its current work, or 0."""
 
     store: str
     journalled: int
@@ -248,9 +241,9 @@ class ServerAlive:
 
 @dataclass(frozen=True)
 class FollowerState:
-    """A follower that answers. store, merged: see MapVersion; journalled: the last row of the journal, as it knows.
+    """An answering follower. store, merged: see MapVersion; journalled: last journal row it knows.
 
-    behind_rows: rows that its map lacks. behind_s: its map had all that was in the journal so long ago, or later.
+    behind_rows: rows its map lacks. behind_s: upper bound of its map's lag.
     """
 
     name: str
@@ -266,11 +259,11 @@ class FollowerState:
 
 @dataclass(frozen=True)
 class MachineState:
-    """What the map server knows of one machine.
+    """The map server's view of a machine.
 
-    trusted: whether its samples are in the map. by: who decided that last: `audit` (the server), `person`, or empty.
-    reason: one line. since_ns: the site's now at the decision, 0 for never. contradicts: whether it contradicts all
-    others now. reasons, evidence: in what, and by which figures. The counts: see SampleCounts.
+    trusted: its samples are in the map. by: last decision by `audit` (the server), `person`, or empty. reason: one
+    line. since_ns: the site's now then, or 0. contradicts: it contradicts all others now; reasons, evidence: in what,
+    with figures. Counts: see SampleCounts.
     """
 
     name: str
@@ -290,7 +283,7 @@ class MachineState:
 
 @dataclass(frozen=True)
 class TrustAnswer(MachineState):
-    """The machine after a command, and the version of the map that the command counts in: see MapVersion."""
+    """A machine after a command, and the map version in which it counts."""
 
     store: str
     merged: int
@@ -299,7 +292,7 @@ class TrustAnswer(MachineState):
 
 @dataclass(frozen=True)
 class MachinesAnswer(_OfVersion):
-    """All machines that have sent something."""
+    """All machines that have sent."""
 
     machines: tuple[MachineState, ...]
     version: MapVersion
@@ -307,10 +300,10 @@ class MachinesAnswer(_OfVersion):
 
 @dataclass(frozen=True)
 class GroundChange:
-    """One change of the ground.
+    """A change of the ground.
 
-    id: 1, 2, 3... first_ns, last_ns: between them it took place, cell by cell. bounds: west, south, east, north [m].
-    cells: how many are known to have changed. resistance [-], grade [m/m]: medians over them; None is unknown.
+    id: 1, 2, 3... first_ns, last_ns: it happened in between, cell by cell. bounds: west, south, east, north [m]. cells:
+    known to have changed. resistance [-], grade [m/m]: medians, None if unknown.
     """
 
     id: int
@@ -326,7 +319,7 @@ class GroundChange:
 
 @dataclass(frozen=True)
 class ChangesAnswer(_OfVersion):
-    """Changes of the ground, in the order of their ids."""
+    """Changes of the ground, by id."""
 
     changes: tuple[GroundChange, ...]
     version: MapVersion

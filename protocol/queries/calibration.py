@@ -1,7 +1,4 @@
-"""What the map server takes off the samples of each machine: the answer of `calibration`, and its bytes.
-
-(docs/protocol.md, "Calibration")
-"""
+"""The answer of `calibration`, corrections of machines' samples, and its bytes (docs/protocol.md, "Calibration")."""
 
 from __future__ import annotations
 
@@ -13,11 +10,11 @@ from protocol.wire.fields import pack, unpack
 
 @dataclass(frozen=True)
 class CorrectedSpan:
-    """What is taken off a machine's samples with from_ns <= stamp < to_ns.
+    """Correction of samples with from_ns <= stamp < to_ns.
 
-    zero: of the balance [-], which is also how much too low the slope ahead is [m/m]; scale: share of the measured
-    drive force that is not there; across: how much too high the slope to the left is [m/m]. most_share: resistances of
-    samples with a larger drive force over weight stay as they were.
+    zero: bias of the balance [-], so the slope ahead is too low by it [m/m]; scale: false share of measured drive
+    force; across: excess of the slope to the left [m/m]. most_share: drive force over weight up to which resistances
+    are corrected.
     """
 
     from_ns: int
@@ -30,12 +27,11 @@ class CorrectedSpan:
 
 @dataclass(frozen=True)
 class MachineCalibration:
-    """The calibration of one machine by the map server.
+    """A machine's calibration by the map server.
 
-    by: who decided last, `solver` or `person`, empty where nothing is decided; reason: one line; since_ns: the site's
-    now then. zero, scale, across: as in CorrectedSpan, of the last solve, with standard deviations; None where it knows
-    nothing of the machine. zero_by, scale_by: what shows them; empty: the data sheet has to do. spans: what counts,
-    oldest first, of many the newest.
+    by: last decision by `solver`, `person` or empty; reason: one line; since_ns: the site's now then. zero, scale,
+    across: see CorrectedSpan, of the last solve, with standard deviations, or None. zero_by, scale_by: what shows them;
+    empty: the data sheet. spans: in effect, oldest first, limited to the newest.
     """
 
     name: str
@@ -57,9 +53,8 @@ class MachineCalibration:
 class CalibrationAnswer:
     """All machines.
 
-    store, merged, fact: the version of the map that `spans` count in. solved_ns: the site's now at the last solve, 0
-    for none. common_scale_std: of the mean scale of all machines; common_scale_unknown: why nothing shows it, a word,
-    empty where it is known.
+    store, merged, fact: map version of `spans`. solved_ns: the site's now at the last solve, or 0. common_scale_std: of
+    the machines' mean scale; common_scale_unknown: a word for why nothing shows it, or empty.
     """
 
     store: str
@@ -72,7 +67,7 @@ class CalibrationAnswer:
 
 
 def encode_calibration(answer: CalibrationAnswer) -> bytes:
-    """Answer of `calibration`, as a query and as a command."""
+    """Answer of `calibration`, query and command."""
     return pack({"calibration": asdict(answer)})
 
 

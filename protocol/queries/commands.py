@@ -1,4 +1,4 @@
-"""Commands to a map server, on keys of their own so that access rules can tell them from queries (docs/protocol.md)."""
+"""Commands to a map server, with keys of their own for access rules (docs/protocol.md)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from protocol.queries.parameters import LINE, MAX_WAIT_S, choice, name_of, numbe
 from protocol.queries.request import Codec, Request, asked, parse
 from protocol.wire.fields import STORE_ID
 
-# By which a person may correct: an accelerometer that lies on its side, a torque that reads twice or half as much.
+# Bounds of corrections by a person: an accelerometer on its side, torque of twice or half.
 MOST_OFF = {"zero": 0.5, "scale": 0.9, "across": 0.5}
 _VERDICTS = choice({"yes": True, "no": False, "auto": None})
 _STORE = name_of(STORE_ID, "an id of a store; that is 16 hex digits, as an agent names it")
@@ -26,8 +26,7 @@ WAIT = "how long to wait for the map to be folded again [s]"
 class TrustCommand(Request[TrustAnswer]):
     """Trust a machine or not.
 
-    trusted: None leaves it to the server. reason: one line, required to distrust. wait_s: how long to wait for the map
-    to be folded again with it, or without it.
+    trusted: None leaves it to the server. reason: one line, required to distrust. wait_s: for the new fold of the map.
     """
 
     machine: str = asked(name_of(), "machine", "its name")
@@ -46,7 +45,7 @@ class TrustCommand(Request[TrustAnswer]):
 
 @dataclass(frozen=True)
 class AcceptCommand(Request[MapInfo]):
-    """Let the server's store take the place of another one, which is gone. store: its id; reason: one line."""
+    """Let the server's store replace a lost one. store: its id; reason: one line."""
 
     store: str = asked(_STORE, "store", "id of the store that is gone")
     reason: str = asked(LINE, "reason", "one line: what became of it", "")
@@ -62,11 +61,10 @@ class AcceptCommand(Request[MapInfo]):
 
 @dataclass(frozen=True)
 class CalibrateCommand(Request[CalibrationAnswer]):
-    """Calibrate all machines with all samples that there are, or decide what is taken off those of one.
+    """Calibrate all machines with all samples, or decide one machine's correction.
 
-    machine: empty for all. zero, scale, across: of that one, as in `protocol.queries.calibration.CorrectedSpan`, for
-    all of its samples; None for what is not given. auto: leaves that machine to the server again. reason: one line,
-    required with values. wait_s: how long to wait for the map to be folded again.
+    machine: empty for all. zero, scale, across: for all its samples, see `protocol.queries.calibration.CorrectedSpan`;
+    None if not given. auto: return it to the server. reason: one line, required with values. wait_s: for the new fold.
     """
 
     machine: str = asked(name_of(), "machine", "the one that is decided about; without it all", "")
@@ -94,7 +92,7 @@ class CalibrateCommand(Request[CalibrationAnswer]):
 
     @property
     def values(self) -> dict[str, float]:
-        """Those that are given, by name."""
+        """Given values by name."""
         given = {"zero": self.zero, "scale": self.scale, "across": self.across}
         return {name: value for name, value in given.items() if value is not None}
 
@@ -103,7 +101,7 @@ COMMANDS: dict[str, type[Request[Any]]] = {cls.name: cls for cls in (TrustComman
 
 
 def parse_command(name: str, parameters: Mapping[str, str]) -> Request[Any]:
-    """The command of a name and the parameters of its selector; QueryError says what is wrong with which of them."""
+    """Parse a command; QueryError names the wrong parameter."""
     return parse("command", COMMANDS, name, parameters)
 
 

@@ -1,4 +1,4 @@
-"""How much ground the map knows, how old that is, and who drove it: the query `coverage`, its answer, and its bytes."""
+"""The query `coverage`: how much ground is known, how old, by whom; its answer and bytes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from protocol.wire.fields import pack, unpack
 
 @dataclass(frozen=True)
 class Coverage:
-    """Ground of an area, in square metres.
+    """Ground of an area [m2].
 
-    driven_m2: of cells that any machine drove over; known_m2: of those whose resistance is known. driven_since_m2: of
-    cells driven in the last hour, day and week before stamp_ns, by these names. machines_m2: driven by each machine;
-    with more than a few machines on the site, another one's ground may be counted too.
+    driven_m2: of driven cells; known_m2: with known resistance. driven_since_m2: driven in the last hour, day, week
+    before stamp_ns. machines_m2: by machine; with many machines another's ground may be counted too.
     """
 
     store: str
@@ -41,7 +40,7 @@ def _decode(data: bytes) -> Coverage:
 
 @dataclass(frozen=True)
 class CoverageQuery(AsOf[Coverage], Fresh[Coverage]):
-    """How much ground is driven and known, by age and machine. bounds: in this rectangle; None: in all of the map."""
+    """Driven and known ground, by age and machine, in a rectangle or (None) the whole map."""
 
     bounds: Bounds | None = asked(RECTANGLE, "bounds", "west,south,east,north [m]; default all of the map", None)
 

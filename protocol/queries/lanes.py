@@ -1,4 +1,4 @@
-"""Lanes: where machines drove, by heading; the query `lanes`, its answer, and its bytes."""
+"""Lanes, where machines drove by heading: the query `lanes`, its answer and bytes."""
 
 from __future__ import annotations
 
@@ -19,21 +19,20 @@ from protocol.site.geometry import BLOCK_CELLS, Bounds
 from protocol.wire.codec import MAX_SEQ
 from protocol.wire.fields import check, inflated, pack, take, take_int, take_store, unpack
 
-SECTORS = 16  # of heading, the first one centred on east
+SECTORS = 16  # of heading, the first centred on east
 SHAPE = (SECTORS, BLOCK_CELLS * BLOCK_CELLS)
-SCALE_M = Scale("log", 0.1, 100.0)  # metres driven in 8 bits: a step is 2.8 %
-MOST_TILES = 16_384  # of one answer: 4 km2 of driven ground with cells of 1 m
+SCALE_M = Scale("log", 0.1, 100.0)  # metres in 8 bits: a step is 2.8 %
+MOST_TILES = 16_384  # per answer: 4 km2 of driven 1 m cells
 MAX_LANES_BYTES = 2**26
-MOST = 2**31 - 1  # of a place, and of passes
+MOST = 2**31 - 1  # of positions and passes
 
 
 @dataclass(frozen=True)
 class LaneTile:
-    """Lanes of a square of 16 x 16 cells.
+    """Lanes in a square of 16 x 16 cells.
 
-    x, y: its column and row. newest_ns: stamp of its newest sample. passes: most that one of its cells has seen;
-    days: on how many it was driven, machines: by how many. metres: (16, 256) by sector of heading and cell, row by row
-    from the south, in steps of SCALE_M, 0 for none; what was driven long ago, and before many others, counts less.
+    x, y: its column and row. newest_ns: newest stamp. passes: maximum of a cell; days, machines: number. metres: (16,
+    256), by heading sector and cell, rows from the south, in steps of SCALE_M, 0 for none; old driving counts less.
     """
 
     x: int
@@ -47,7 +46,7 @@ class LaneTile:
 
 @dataclass(frozen=True)
 class LanesAnswer:
-    """Squares of a version of the map into which evidence came since a stamp, or all. stamp_ns: the site's now."""
+    """Squares with evidence since a stamp, or all. stamp_ns: the site's now."""
 
     version: MapVersion
     stamp_ns: int
@@ -61,7 +60,7 @@ HEAD = (*_WHOLE, *_COUNTS)
 
 
 def encode_lanes(answer: LanesAnswer) -> bytes:
-    """The squares' numbers column by column, and all metres deflated together."""
+    """Numbers of the squares as columns, all metres deflated together."""
     version, tiles = answer.version, answer.tiles
     columns = {name: np.array([getattr(tile, name) for tile in tiles], "<i8").tobytes() for name, _, _ in HEAD}
     metres = b"".join(tile.metres.tobytes() for tile in tiles)
@@ -71,7 +70,7 @@ def encode_lanes(answer: LanesAnswer) -> bytes:
 
 
 def decode_lanes(data: bytes) -> LanesAnswer:
-    """Undo `encode_lanes`; a MessageError says what is wrong."""
+    """Undo `encode_lanes`; MessageError."""
     table = unpack(data, MAX_LANES_BYTES)
     n, cell_m, cols = take_int(table, "n", 0, MOST_TILES), take(table, "cell_m", float), take(table, "cols", dict)
     check(0.01 <= cell_m <= 100, "cell_m", f"{cell_m} is not between 0.01 and 100")
@@ -85,7 +84,7 @@ def decode_lanes(data: bytes) -> LanesAnswer:
 
 
 def strokes(answer: LanesAnswer) -> dict[str, Floats]:
-    """Cells that are driven, as columns: middle [m], heading of the sector that is driven most [rad], metres in it."""
+    """Driven cells as columns: centre [m], main heading [rad], metres in it."""
     steps = np.array([tile.metres for tile in answer.tiles], np.uint8).reshape(-1, *SHAPE)
     metres = np.nan_to_num(SCALE_M.values())[steps]
     most = metres.max(axis=1)
@@ -107,7 +106,7 @@ def _column(cols: dict[str, object], name: str, n: int, low: int, high: int) -> 
 
 @dataclass(frozen=True)
 class LanesQuery(MapQuery[LanesAnswer]):
-    """Lanes of a rectangle, None for all of the map; since_ns: of squares with samples after this stamp alone."""
+    """Lanes of a rectangle or (None) the whole map; since_ns: only squares with later samples."""
 
     bounds: Bounds | None = asked(RECTANGLE, "bounds", "west,south,east,north [m]; default all of the map", None)
     since_ns: int | None = asked(STAMP, "since", "squares with samples after this time alone", None)

@@ -1,4 +1,4 @@
-"""Tiles: the map in squares of 64 x 64 cells, a few layers in 8 bits each, for pages that draw it."""
+"""Tiles: squares of 64 x 64 cells with a few 8-bit layers, for drawing."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from protocol.wire.fields import inflated, pack, take, unpack
 
 TILE_CELLS = 64
 AREA = TILE_CELLS * TILE_CELLS
-MAX_TILES = 100_000  # of one answer: a square of 20 km
+MAX_TILES = 100_000  # per answer: a square of 20 km
 Plane = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What 8 bits mean: 0 unknown, 1 to 255 a value.
+    """Meaning of 8 bits: 0 unknown, 1 to 255 a value.
 
-    kind: "log" and "linear" from low to high, in even steps; "count" the value itself; "since" seconds before the
-    newest sample of the tile, low (2^((q - 1) / steps) - 1).
+    kind: "log", "linear": even steps from low to high; "count": the value; "since": seconds before the tile's newest
+    sample, low (2^((q - 1) / steps) - 1).
     """
 
     kind: Literal["log", "linear", "count", "since"]
@@ -37,7 +37,7 @@ class Scale:
     steps: float = 0.0
 
     def quantised(self, values: Floats) -> Plane:
-        """8 bits (...) for values (...): the nearest step, 0 for NaN; what is beyond the ends takes the end."""
+        """8 bits (...) of values (...): nearest step, clipped; 0 for NaN."""
         with np.errstate(divide="ignore", invalid="ignore"):
             match self.kind:
                 case "log":
@@ -53,7 +53,7 @@ class Scale:
         return out
 
     def values(self) -> Floats:
-        """The values (256,) of all steps; NaN for 0."""
+        """Values (256,) of all steps; NaN for 0."""
         step = np.arange(256, dtype=np.float64)
         part = (step - 1) / 254
         match self.kind:
@@ -69,8 +69,7 @@ class Scale:
         return out
 
 
-# A step of c_rr is 1.8 %, one of a slope 0.3 % of grade, one of time 4 %, up to a week. Cells in which machines drove
-# and measured nothing have visits alone.
+# Steps: c_rr 1.8 %, slope 0.3 % grade, time 4 % up to a week. Driven cells without measurement have visits only.
 PLANES: dict[str, Scale] = {
     "resistance": Scale("log", 0.004, 0.4),
     "confidence": Scale("linear", 0.0, 1.0),
@@ -83,10 +82,10 @@ PLANES: dict[str, Scale] = {
 
 @dataclass(frozen=True)
 class MapTile:
-    """One square: x, y columns and rows of tiles from the origin.
+    """A square; x, y: tile column and row from the origin.
 
-    row, fact: the version of the map in which it was last another one. newest_ns: stamp of its newest sample. planes:
-    the planes of PLANES in their order, each row by row from the south, deflated (zlib).
+    row, fact: map version of its last change. newest_ns: newest stamp. planes: those of PLANES in order, rows from the
+    south, deflated (zlib).
     """
 
     x: int
@@ -97,16 +96,16 @@ class MapTile:
     planes: bytes
 
     def unpacked(self) -> dict[str, Plane]:
-        """The planes (64, 64) by name."""
+        """Planes (64, 64) by name."""
         data = np.frombuffer(zlib.decompress(self.planes), np.uint8).reshape(len(PLANES), TILE_CELLS, TILE_CELLS)
         return dict(zip(PLANES, data, strict=True))
 
 
 @dataclass(frozen=True)
 class TilesAnswer:
-    """Tiles of one version of the map. whole: all that there are; else those that differ since a version.
+    """Tiles of a map version. whole: all; else those changed since a version.
 
-    next_place: where the rest begins, column and row of a tile; None where this is all.
+    next_place: tile column and row at which the rest begins, or None.
     """
 
     version: MapVersion
@@ -127,7 +126,7 @@ def encode_tiles(answer: TilesAnswer) -> bytes:
 
 
 def decode_tiles(data: bytes) -> TilesAnswer:
-    """Undo `encode_tiles`; refuses tiles whose planes are not those of PLANES."""
+    """Undo `encode_tiles`; planes other than PLANES are refused."""
     table = unpack(data, 2**28, MAX_TILES)
     if (names := take(table, "planes", list)) != list(PLANES):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{names!s:.80} are not {', '.join(PLANES)}", field="planes")
@@ -174,9 +173,9 @@ TILE = ValueKind(ValueForm.TEXT, _read_tile, lambda value: f"{value[0]},{value[1
 
 @dataclass(frozen=True)
 class TilesQuery(AsOf[TilesAnswer]):
-    """Tiles of the map: all, or those that differ since a version of it; or all as of a time [ns].
+    """Tiles of the map: all, those changed since a version, or all as of a time [ns].
 
-    place: column and row of the tile from which on they are answered, in this order; None for the first answer.
+    place: column and row of the first tile to answer; None from the beginning.
     """
 
     since: MapVersion | None = grouped(

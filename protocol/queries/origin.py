@@ -1,6 +1,6 @@
-"""Who has answered a map query, and how far behind the journal its map was (docs/protocol.md, "Who answers").
+"""Who answered a map query, and its lag behind the journal (docs/protocol.md, "Who answers").
 
-It stands beside an answer and not in it: answers of one version of the map are the same bytes, whoever gives them.
+It stands beside the answer: answers of one map version are the same bytes from anyone.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from dataclasses import asdict, dataclass
 from protocol.errors import MessageError, Refusal
 from protocol.wire.fields import MAX_SMALL_BYTES, pack, take, take_name, unpack
 
-SHOWN_S = 10.0  # behind: a follower that is more is not offered to clients, until it has caught up
+SHOWN_S = 10.0  # lag beyond which a follower is not offered to clients
 
 
 @dataclass(frozen=True)
 class Origin:
-    """follower: its name, empty for the map server. behind_rows: rows that were journalled and not in its map.
+    """Source of an answer. follower: its name, empty for the map server.
 
-    behind_s: its map had all that was in the journal so long ago, or later [s].
+    behind_rows: journalled rows missing in its map. behind_s: upper bound of the map's lag [s].
     """
 
     follower: str = ""
@@ -34,7 +34,7 @@ SERVER = Origin()
 
 
 def encode_origin(origin: Origin) -> bytes:
-    """The attachment of an answer."""
+    """An answer's attachment."""
     table = asdict(origin)
     return pack(table if origin.follower else {name: table[name] for name in table if name != "follower"})
 

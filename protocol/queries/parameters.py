@@ -1,7 +1,4 @@
-"""Kinds of parameters of a selector: the text of a value, and the checked value of a text.
-
-QueryError names the parameter and what is wrong with it.
-"""
+"""Kinds of selector parameters: values to text and back, checked; QueryError names the parameter."""
 
 from __future__ import annotations
 
@@ -19,30 +16,30 @@ from protocol.site.geometry import Bounds
 from protocol.site.site_config import NAME
 
 MAX_WAIT_S = 60.0
-MAX_TEXT = 200  # characters of a text that a person writes
+MAX_TEXT = 200  # characters of a person's text
 MAX_NUMBER = 1e15
 
 Parameters = Mapping[str, str]
 
 
 def text_of(number: float) -> str:
-    """All digits; as a plain number, where numpy's own `repr` writes its type."""
+    """All digits, as a plain number, without numpy's type."""
     return repr(float(number))
 
 
 def selector_of(parameters: Parameters) -> str:
-    """Parameters as they stand in a selector, behind its question mark."""
+    """Parameters in a selector, behind the question mark."""
     return ";".join(f"{name}={value}" for name, value in parameters.items())
 
 
 def split_selector(text: str) -> dict[str, str]:
-    """Undo `selector_of`; by hand, because a missing value must be seen as one."""
+    """Undo `selector_of`; keeps missing values visible."""
     pairs = (part.partition("=") for part in text.split(";") if part)
     return {name: value for name, _, value in pairs}
 
 
 def refusal(parameter: str, problem: str, reason: Refusal = Refusal.OUT_OF_RANGE) -> QueryError:
-    """What is wrong with a parameter."""
+    """The error of a parameter."""
     return QueryError(reason, f"parameter `{parameter}`: {problem}")
 
 
@@ -57,36 +54,33 @@ def read_number(name: str, text: str) -> float:
 
 
 def check_finite(name: str, value: float) -> None:
-    """Refuse what is no finite number of a usual size."""
+    """Refuse what is not finite and of usual size."""
     if not math.isfinite(value) or abs(value) > MAX_NUMBER:
         raise refusal(name, f"{value} is not usable", Refusal.NOT_FINITE)
 
 
 def check_order(from_ns: int | None, to_ns: int | None) -> None:
-    """Refuse a time that ends before it begins."""
+    """Refuse an end before the begin."""
     if from_ns and to_ns and from_ns > to_ns:
         raise QueryError(Refusal.OUT_OF_RANGE, f"`from` ({from_ns}) is after `to` ({to_ns})")
 
 
 class ValueForm(Enum):
-    """How a value is given: on the command line, in a request over HTTP."""
+    """Form of a value on the command line and over HTTP."""
 
     NUMBER = auto()
     TEXT = auto()
-    LINE = auto()  # of a person, which a selector has percent-encoded
+    LINE = auto()  # of a person, percent-encoded in selectors
     FLAG = auto()
     STAMP = auto()
-    PLACE = auto()  # in metres, as the next two
+    PLACE = auto()  # in metres, like the next two
     PLACES = auto()
     RECTANGLE = auto()
 
 
 @dataclass(frozen=True)
 class ValueKind:
-    """A kind of value. read: of a parameter's name and text. write: its text, empty for what a selector leaves out.
-
-    check: refuses a value of the kind that is too large or too small, by the parameter's name.
-    """
+    """A kind of value. read: from name and text. write: text, empty if left out. check: refuses values out of range."""
 
     form: ValueForm
     read: Callable[[str, str], Any]
@@ -95,7 +89,7 @@ class ValueKind:
 
 
 def number(low: float = -MAX_NUMBER, high: float = MAX_NUMBER, unit: str = "", *, above: bool = False) -> ValueKind:
-    """A number from low to high; above: not low itself."""
+    """A number from low to high; above: excluding low."""
 
     def check(name: str, value: float) -> None:
         check_finite(name, value)
@@ -114,7 +108,7 @@ METRES = number()
 
 
 def count(low: int = 0, high: int = int(MAX_NUMBER), *, is_stated: bool = False) -> ValueKind:
-    """A whole number from low to high; is_stated: written also if it is 0."""
+    """An integer from low to high; is_stated: write 0 too."""
 
     def read(name: str, text: str) -> int:
         value = read_number(name, text)
@@ -142,11 +136,11 @@ def _check_stamp(name: str, value: int) -> None:
         raise refusal(name, f"{value} is not between 1 and {MAX_STAMP_NS}")
 
 
-STAMP = ValueKind(ValueForm.STAMP, _read_stamp, str, _check_stamp)  # nanoseconds since 1970, UTC, to the last digit
+STAMP = ValueKind(ValueForm.STAMP, _read_stamp, str, _check_stamp)  # nanoseconds since 1970, UTC, all digits
 
 
 def flag(*, usual: bool) -> ValueKind:
-    """Yes or no, as 1 or 0; left out where it is as usual."""
+    """Yes or no, as 1 or 0; the usual one is left out."""
 
     def read(name: str, text: str) -> bool:
         if text not in ("0", "1"):
@@ -157,7 +151,7 @@ def flag(*, usual: bool) -> ValueKind:
 
 
 def choice(values: Mapping[str, Any], usual: str = "") -> ValueKind:
-    """One of some words, each with what it means; usual: the word that is not written."""
+    """A word with its meaning; the usual one is left out."""
 
     def read(name: str, text: str) -> Any:
         if text not in values:
@@ -175,7 +169,7 @@ def choice(values: Mapping[str, Any], usual: str = "") -> ValueKind:
     return ValueKind(ValueForm.TEXT, read, write, check)
 
 
-# Names, comma-separated; left out where there are none.
+# Comma-separated names, left out if none.
 WORDS = ValueKind(ValueForm.TEXT, lambda _, text: tuple(part for part in text.split(",") if part), ",".join)
 
 
@@ -184,14 +178,14 @@ def _check_line(name: str, value: str) -> None:
         raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}` must be one line of at most {MAX_TEXT} characters")
 
 
-# One line that a person wrote, percent-encoded; left out where it is empty.
+# A person's line, percent-encoded, left out if empty.
 LINE = ValueKind(
     ValueForm.LINE, lambda _, text: unquote(text).strip(), lambda value: quote(value, safe=""), _check_line
 )
 
 
 def name_of(pattern: re.Pattern[str] = NAME, rule: str = "a name") -> ValueKind:
-    """A name by a rule, which `rule` says in words."""
+    """A name by a pattern; rule: the pattern in words."""
 
     def read(name: str, text: str) -> str:
         if not pattern.fullmatch(text):

@@ -1,4 +1,4 @@
-"""Places, lines and outlines as selector parameters: x,y,x,y,... in metres of `map`; QueryError names what is wrong."""
+"""Places, lines, outlines as selector parameters: x,y,x,y,... in metres of `map`; QueryError."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from protocol.site.geometry import Bounds
 
 Place = tuple[float, float]
 
-MAX_PLACES = 10_000  # of one line or list
-MAX_CORNERS = 500  # of one outline: each of its sides is compared with each other one
-PLACES_BYTES = 2**19  # of the parameters of a query with places: MAX_PLACES of them with all their digits
+MAX_PLACES = 10_000  # per line or list
+MAX_CORNERS = 500  # per outline: all sides are compared pairwise
+PLACES_BYTES = 2**19  # of a query's parameters: MAX_PLACES with all digits
 
 
 def places(most: int = MAX_PLACES) -> ValueKind:
-    """So many places at most, x,y,x,y,... in metres; left out where there are none."""
+    """Up to `most` places, x,y,x,y,... [m]; left out if none."""
 
     def read(name: str, text: str) -> tuple[Place, ...]:
         parts = text.split(",")
@@ -55,7 +55,7 @@ def check_count(name: str, count: int, most: int = MAX_PLACES) -> None:
 
 
 def check_outline(name: str, corners: Sequence[Place]) -> None:
-    """Refuse what is no simple polygon: too few corners or too many, no numbers, sides that meet but at corners."""
+    """Refuse what is no simple polygon: wrong number of corners, no numbers, sides that meet elsewhere."""
     if len(corners) < 3:
         raise refusal(name, f"{len(corners)} corners; an outline has at least three")
     check_count(name, len(corners), MAX_CORNERS)
@@ -99,13 +99,13 @@ AREA = Group((_BOUNDS, _POLYGON), _read_area, _write_area, _check_area)
 
 
 def around(corners: Sequence[Place]) -> Bounds:
-    """The rectangle around an outline."""
+    """Bounding rectangle of an outline."""
     x_m, y_m = zip(*corners, strict=True)
     return Bounds(min(x_m), min(y_m), max(x_m), max(y_m))
 
 
 def where_it_lies(bounds: Sequence[int] | None, cell_m: float) -> str:
-    """Where a map lies, and what numbers elsewhere may be; bounds: west, south, east, north in cells, None for none."""
+    """Where a map lies, and a guess at wrong numbers; bounds: west, south, east, north in cells, or None."""
     if not bounds:
         return "nothing is driven yet; are these UTM or degrees?"
     west, south, east, north = (edge * cell_m for edge in bounds)
@@ -117,7 +117,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def _near(corner: Floats, side: Floats) -> tuple[Ints, Ints]:
-    """Pairs of sides whose rectangles have a point in common, but for those that share a corner."""
+    """Pairs of sides whose rectangles touch, except neighbours."""
     low, high = np.minimum(corner, corner + side), np.maximum(corner, corner + side)
     over = (low[:, None] <= high[None]).all(axis=2)
     i, j = np.nonzero(np.triu(over & over.T, 2))
@@ -126,12 +126,12 @@ def _near(corner: Floats, side: Floats) -> tuple[Ints, Ints]:
 
 
 def _meet(corner: Floats, side: Floats, i: Ints, j: Ints) -> Bools:
-    """Whether sides i and j (k,) have a point in common."""
+    """Whether sides i and j (k,) touch."""
     between = corner[j] - corner[i]
-    # the ends of each on which side of the other
+    # on which side of the other each end lies
     ends = (
         (_cross(side[i], between), _cross(side[i], between + side[j])),
         (_cross(side[j], -between), _cross(side[j], side[i] - between)),
     )
-    apart = [np.sign(one) * np.sign(other) > 0 for one, other in ends]  # of sides on one line their rectangles decide
+    apart = [np.sign(one) * np.sign(other) > 0 for one, other in ends]  # collinear sides: their rectangles decide
     return np.asarray(~apart[0] & ~apart[1])

@@ -1,4 +1,4 @@
-"""Why a cell has its value: the answer of `why`, and its bytes (docs/protocol.md, "Why")."""
+"""Why a cell has its value: the answer of `why` and its bytes (docs/protocol.md, "Why")."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from protocol.wire.fields import pack, unpack
 
 @dataclass(frozen=True)
 class Votes:
-    """A histogram of one cell. centres of the bins; votes: metres driven, in each; before: those before a change."""
+    """A cell's histogram. centres of bins; votes: metres in each; before: those before a change."""
 
     centres: tuple[float, ...]
     votes: tuple[float, ...]
@@ -22,10 +22,9 @@ class Votes:
 class CellReasons:
     """Why a cell has its value.
 
-    store, merged, fact: the version of the map. x_m, y_m: centre of the cell. values: its layers; before: those of the
-    evidence before its last change; None is unknown. metres: of evidence that holds. newest_ns: stamp of its newest
-    sample, changed_ns: of its last change; 0 for none. sectors: metres driven by heading, from east, counter-clockwise.
-    machines: who was here; with more than a few machines on the site, another one may be named too.
+    store, merged, fact: map version. x_m, y_m: centre. values: layers; before: those before its last change; None is
+    unknown. metres: of valid evidence. newest_ns, changed_ns: stamps of newest sample and last change, or 0. sectors:
+    metres by heading, counter-clockwise from east. machines: visitors; with many machines another may be named too.
     """
 
     store: str

@@ -1,7 +1,7 @@
-"""What all queries and commands are: frozen records whose fields say which parameters of a selector they are.
+"""Queries and commands: frozen records whose fields are selector parameters.
 
-A field is declared once, by `asked` or `grouped`. From it follow the selector both ways, options of the command line,
-parameters of HTTP and their description. A field that several queries have stands in a class that they share.
+A field is declared once, by `asked` or `grouped`; selector, command line, HTTP parameters and descriptions follow.
+Shared fields stand in a shared class.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ ASKED = "asked"
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a selector. help: what it is, a line for people."""
+    """A selector parameter. help: one line for people."""
 
     name: str
     help: str
     kind: ValueKind
 
     def read(self, parameters: Parameters) -> Any:
-        """Its value; QueryError where it is missing, or wrong."""
+        """Its value; QueryError if missing or wrong."""
         if self.name not in parameters:
             raise QueryError(Refusal.MISSING_FIELD, f"parameter `{self.name}` is missing")
         return self.kind.read(self.name, parameters[self.name])
 
     def write(self, value: Any) -> dict[str, str]:
-        """Undo `read`; empty where it is left out."""
+        """Undo `read`; empty if left out."""
         text = self.kind.write(value)
         return {self.name: text} if text else {}
 
     def check(self, value: Any) -> None:
-        """Refuse a value of the wrong size."""
+        """Refuse a value out of range."""
         self.kind.check(self.name, value)
 
 
 @dataclass(frozen=True)
 class Group:
-    """Parameters that make up one value. read: of those that are given; write, check: as of a parameter."""
+    """Parameters of one value. read: from those given; write, check: as of a parameter."""
 
     parameters: tuple[Parameter, ...]
     read: Callable[[Parameters], Any]
@@ -54,7 +54,7 @@ class Group:
 
 
 def asked(kind: ValueKind, name: str, help: str, default: Any = MISSING) -> Any:  # noqa: A002 - as argparse has it
-    """A field of a request that is one parameter."""
+    """A field of one parameter."""
     one = Parameter(name, help, kind)
     if default is not None:
         return grouped(Group((one,), one.read, one.write, one.check), default)
@@ -67,12 +67,12 @@ def _if_given(check: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 def grouped(group: Group, default: Any = MISSING) -> Any:
-    """A field of a request that is made up of several parameters."""
+    """A field of several parameters."""
     return field(default=default, metadata={ASKED: group})
 
 
 def groups(cls: Any) -> tuple[tuple[Field[Any], Group], ...]:
-    """Fields of a class of requests, and their parameters; worked out once."""
+    """Fields of a request class and their parameters, cached."""
     if cls not in _GROUPS:
         _GROUPS[cls] = tuple((one, one.metadata[ASKED]) for one in fields(cls))
     return _GROUPS[cls]
@@ -82,12 +82,12 @@ _GROUPS: dict[Any, tuple[tuple[Field[Any], Group], ...]] = {}
 
 
 def parameters_of(cls: type[Request[Any]]) -> dict[str, Parameter]:
-    """All parameters of a class of requests, by name."""
+    """A request class's parameters by name."""
     return {one.name: one for _, group in groups(cls) for one in group.parameters}
 
 
 class Codec(NamedTuple):
-    """Bytes of an answer, both ways."""
+    """Bytes of an answer."""
 
     encode: Callable[[Any], bytes]
     decode: Callable[[bytes], Any]
@@ -95,7 +95,7 @@ class Codec(NamedTuple):
 
 @dataclass(frozen=True)
 class Request(Generic[T]):
-    """A query or a command, whose answer is a T. name: as on the wire. codec: of its answer."""
+    """A query or command with an answer T. name: on the wire. codec: of the answer."""
 
     name: ClassVar[str]
     codec: ClassVar[Codec]
@@ -114,7 +114,7 @@ class Request(Generic[T]):
         return answer
 
     def parameters(self) -> dict[str, str]:
-        """Parameters of its selector."""
+        """Selector parameters."""
         return {
             name: text
             for one, group in groups(type(self))
@@ -126,7 +126,7 @@ R = TypeVar("R", bound=Request[Any])
 
 
 def parse(what: str, table: Mapping[str, type[R]], name: str, parameters: Parameters) -> R:
-    """Undo `parameters` of the request `name` of a table; QueryError says what is wrong with which parameter."""
+    """Undo `parameters` of the request `name` of a table; QueryError names the wrong parameter."""
     if name not in table:
         raise QueryError(Refusal.UNKNOWN_QUERY, f"{what} `{name[:40]}` is not known; known: {', '.join(table)}")
     cls = table[name]
@@ -144,15 +144,15 @@ def parse(what: str, table: Mapping[str, type[R]], name: str, parameters: Parame
 
 
 class AskFirst(Enum):
-    """Whom a client asks first, and whom where that one does not answer."""
+    """Whom a client asks first, then as fallback."""
 
     FOLLOWER = auto()  # then the server
-    SERVER = auto()  # then a follower, which knows a moment later what the server's events tell
+    SERVER = auto()  # then a follower, which lags the server's events a little
     SERVER_ALONE = auto()
 
 
 class Size(Enum):
-    """What it takes to answer: less than a page, as much as a piece of a region, or a search over the map."""
+    """Cost of an answer: below a page, a piece of a region, or a search over the map."""
 
     SMALL = auto()
     PIECE = auto()
@@ -161,9 +161,9 @@ class Size(Enum):
 
 @dataclass(frozen=True)
 class MapQuery(Request[T]):
-    """A query of the map.
+    """A map query.
 
-    help: what it asks, for people. ask_first, size: see there. after, wait_s: see `Fresh`.
+    help: for people. ask_first, size: see there. after, wait_s: see `Fresh`.
     """
 
     help: ClassVar[str]
@@ -174,36 +174,36 @@ class MapQuery(Request[T]):
 
     @property
     def is_long(self) -> bool:
-        """Whether it is made of far more than it holds, and so keeps a thread for long."""
+        """Whether it reads far more than it returns, and occupies a thread."""
         return False
 
     @property
     def reads_past(self) -> bool:
-        """Whether the server has to read its journal for it, which takes a while."""
+        """Whether the server must read its journal, which takes a while."""
         return False
 
     @property
     def may_read_journal(self) -> bool:
-        """Whether the server may have to, if only as the first one since its start."""
+        """Whether it may have to, if only once since its start."""
         return self.reads_past
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fresh(MapQuery[T]):
-    """A query that can wait. after: answered only once this journal row is merged; wait_s: how long to wait for it."""
+    """A query that can wait. after: journal row to be merged first; wait_s: timeout."""
 
     after: int = asked(count(), "after", "answer once this journal row is merged", 0)
     wait_s: float = asked(number(0.0, MAX_WAIT_S, "s"), "wait", "how long to wait for it [s], 0 to 60", 10.0)
 
     def parameters(self) -> dict[str, str]:
-        """As of any request; a time to wait means nothing without a row."""
+        """Without a row, the timeout is omitted."""
         parameters = super().parameters()
         return parameters if self.after else {name: text for name, text in parameters.items() if name != "wait"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class AsOf(MapQuery[T]):
-    """A query of the map as it was. as_of_ns: from samples stamped so or earlier; None: as it is."""
+    """A query of a past map. as_of_ns: from samples up to this stamp; None: now."""
 
     as_of_ns: int | None = asked(STAMP, "as_of", "the map as of this time", None)
 
@@ -215,7 +215,7 @@ class AsOf(MapQuery[T]):
 
 @dataclass(frozen=True, kw_only=True)
 class Repaired(AsOf[T]):
-    """A query of cells. repairs: those of a road whose ground changed, as `worklist` has it, from the samples since."""
+    """A query of cells. repairs: on changed roads, as in `worklist`, only samples since the change."""
 
     repairs: bool = asked(flag(usual=False), "repairs", f"{REPAIRS} (default 0)", default=False)
 
@@ -227,13 +227,13 @@ class Repaired(AsOf[T]):
 
 @dataclass(frozen=True, kw_only=True)
 class Compared(Repaired[T]):
-    """A query of values that can be compared. minus_ns: less the map as of that time."""
+    """A query of comparable values. minus_ns: subtract the map as of this time."""
 
     minus_ns: int | None = asked(STAMP, "minus", "subtract the map as of this time", None)
 
     @property
     def times(self) -> tuple[int | None, ...]:
-        """Times of the maps that are read: this one, and that which is taken off it."""
+        """Times of the maps read: this one, then the subtracted one."""
         return (self.as_of_ns,) if self.minus_ns is None else (self.as_of_ns, self.minus_ns)
 
     @property

@@ -1,6 +1,6 @@
-"""Map queries (docs/protocol.md, "Map queries"): each is declared here, once, or beside its answer.
+"""Map queries (docs/protocol.md, "Map queries"), declared once, here or beside their answers.
 
-A new one is a class in QUERIES, and a function of the map server that answers it.
+A new one is a class in QUERIES, and a function of the map server.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 
-MAX_SPANS = 2000  # of one history
+MAX_SPANS = 2000  # per history
 MAX_RESOLUTION_M = 1000.0
-WITHOUT_MEAN = ("heading", "resistance_class", "slope_class", "resistance_class_filled")  # layers, in larger cells
+WITHOUT_MEAN = ("heading", "resistance_class", "slope_class", "resistance_class_filled")  # no layers of larger cells
 X, Y = "east of the site's origin [m]", "north of it [m]"
 LAYERS = "names, comma-separated; without it all"
 
 
 @dataclass(frozen=True)
 class PointQuery(Compared[answers.PointAnswer], Fresh[answers.PointAnswer]):
-    """The cell at a position in `map` [m]; no layers means all of them."""
+    """The cell at a position in `map` [m]; no layers means all."""
 
     x_m: float = asked(METRES, "x", X)
     y_m: float = asked(METRES, "y", Y)
@@ -45,7 +45,7 @@ class PointQuery(Compared[answers.PointAnswer], Fresh[answers.PointAnswer]):
 
 @dataclass(frozen=True)
 class PointsQuery(Compared[answers.PointsAnswer], Fresh[answers.PointsAnswer]):
-    """The cells at many places in `map` [m]; no layers means all of them."""
+    """The cells at many positions in `map` [m]; no layers means all."""
 
     places: tuple[Place, ...] = asked(places(), "places", "x,y,x,y,... [m]")
     layers: tuple[str, ...] = asked(WORDS, "layers", LAYERS, ())
@@ -68,10 +68,10 @@ class PointsQuery(Compared[answers.PointsAnswer], Fresh[answers.PointsAnswer]):
 
 @dataclass(frozen=True)
 class RegionQuery(Compared[answers.Region], Fresh[answers.Region]):
-    """All cells that a rectangle touches, or those whose centre lies in an outline; no layers means all of them.
+    """Cells that a rectangle touches, or with centre in an outline; no layers means all.
 
-    area: the outline, by its corners in either direction. resolution_m: of larger cells, a multiple of the map's, each
-    the mean of what is known in it; None for the cells of the map.
+    area: rectangle, or corners of the outline in either direction. resolution_m: edge of larger cells, a multiple of
+    the map's, as means of known cells; None for the map's.
     """
 
     area: Bounds | tuple[Place, ...] = grouped(AREA)
@@ -95,13 +95,13 @@ class RegionQuery(Compared[answers.Region], Fresh[answers.Region]):
 
     @property
     def bounds(self) -> Bounds:
-        """The rectangle, or that around the outline."""
+        """The rectangle, or the outline's."""
         return self.area if isinstance(self.area, Bounds) else around(self.area)
 
 
 @dataclass(frozen=True)
 class PieceQuery(MapQuery[answers.Region]):
-    """One more piece of a region that is answered in pieces; cursor: from its first piece. number: from 0 on."""
+    """Another piece of a region; cursor: of its first piece; number: from 0."""
 
     cursor: int = asked(count(is_stated=True), "cursor", "of the first piece")
     number: int = asked(count(is_stated=True), "number", "of the piece, from 0 on")
@@ -115,10 +115,10 @@ class PieceQuery(MapQuery[answers.Region]):
 
 @dataclass(frozen=True)
 class HistoryQuery(Fresh[answers.HistoryAnswer]):
-    """The cell at a position in `map` [m] over time, span by span.
+    """The cell at a position in `map` [m] over time.
 
-    from_ns, to_ns: samples stamped from_ns <= stamp <= to_ns; to_ns None: the site's now, from_ns None: MAX_SPANS
-    before. span_s: length of a span, None for a bucket.
+    from_ns, to_ns: bounds of stamps, included; default: to the site's now, from MAX_SPANS earlier. span_s: of one span,
+    None for a bucket.
     """
 
     x_m: float = asked(METRES, "x", X)
@@ -146,7 +146,7 @@ class HistoryQuery(Fresh[answers.HistoryAnswer]):
 
 @dataclass(frozen=True)
 class InfoQuery(Fresh[answers.MapInfo]):
-    """The state of the map and of its server."""
+    """State of map and server."""
 
     name = "info"
     help = "state of the map and its server"
@@ -156,7 +156,7 @@ class InfoQuery(Fresh[answers.MapInfo]):
 
 @dataclass(frozen=True)
 class AliveQuery(MapQuery[answers.ServerAlive]):
-    """Whether the server takes batches: for probes, since it waits for nothing."""
+    """Whether the server takes batches; for probes, it never waits."""
 
     name = "alive"
     help = "whether the map server takes batches: for probes"
@@ -166,7 +166,7 @@ class AliveQuery(MapQuery[answers.ServerAlive]):
 
 @dataclass(frozen=True)
 class MachinesQuery(Fresh[answers.MachinesAnswer]):
-    """What the server knows of each machine."""
+    """The server's view of each machine."""
 
     name = "machines"
     help = "state of each machine: samples, trust, reasons"
@@ -176,7 +176,7 @@ class MachinesQuery(Fresh[answers.MachinesAnswer]):
 
 @dataclass(frozen=True)
 class CalibrationQuery(Fresh[CalibrationAnswer]):
-    """What is taken off the samples of each machine, and what is known of its calibration."""
+    """Corrections of machines' samples, and their calibration."""
 
     name = "calibration"
     help = "what is taken off the samples of each machine"
@@ -186,7 +186,7 @@ class CalibrationQuery(Fresh[CalibrationAnswer]):
 
 @dataclass(frozen=True)
 class ChangesQuery(MapQuery[answers.ChangesAnswer]):
-    """Changes of the ground with an id beyond after_id."""
+    """Changes of the ground with an id above after_id."""
 
     after_id: int = asked(count(), "after", "with a number beyond this one", 0)
 
@@ -198,7 +198,7 @@ class ChangesQuery(MapQuery[answers.ChangesAnswer]):
 
 @dataclass(frozen=True)
 class WhyQuery(Repaired[CellReasons]):
-    """Everything that is known of the cell at a position in `map` [m]."""
+    """All about the cell at a position in `map` [m]."""
 
     x_m: float = asked(METRES, "x", X)
     y_m: float = asked(METRES, "y", Y)
@@ -234,5 +234,5 @@ QUERIES: dict[str, type[MapQuery[Any]]] = {
 
 
 def parse_query(name: str, parameters: Mapping[str, str]) -> MapQuery[Any]:
-    """The query of a name and the parameters of its selector; QueryError says what is wrong with which of them."""
+    """Parse a query; QueryError names the wrong parameter."""
     return parse("query", QUERIES, name, parameters)

@@ -1,7 +1,4 @@
-"""Roads, and where work on them pays: the queries `segments` and `worklist`, their answers, and their bytes.
-
-(docs/protocol.md, "Roads")
-"""
+"""Roads, and sections worth grading: `segments` and `worklist`, answers and bytes (docs/protocol.md, "Roads")."""
 
 from __future__ import annotations
 
@@ -15,16 +12,16 @@ from protocol.site.geometry import Bounds
 from protocol.wire.fields import pack, unpack
 
 Corners = tuple[tuple[float, ...], ...]
-MAX_LIMIT = 1000  # stretches of one worklist
+MAX_LIMIT = 1000  # sections of one worklist
 SHARE = number(0.0, 1.0, above=True)
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Fuel:
-    """Litres an hour: value, low and high of 90 %. predicted: by resistance, grade, mass and speed of the same drives.
+    """Litres per hour: value, low and high of 90 %. predicted: by resistance, grade, mass and speed of the same drives.
 
-    share: of the driving, by metres, that states what it burns; both are of this part.
+    share: of driven metres with stated consumption, on which both rest.
     """
 
     burned_ph: tuple[float, ...]
@@ -34,12 +31,11 @@ class Fuel:
 
 @dataclass(frozen=True)
 class RoadSegment:
-    """About 25 m of a road. Pairs are by direction: along the line, and back.
+    """About 25 m of a road. Pairs: along the line, and back.
 
-    id: a place, the same as long as the road is. line: x, y [m]. resistance with its standard deviation, grade (rise
-    over run along the line), trend (change of resistance a day): None where not known. unmeasured: share of it without
-    a resistance. passes_ph, tonnes_ph: an hour; guessed: no machine stated a mass. machines: about how many. fuel: None
-    where no machine says what it burns.
+    id: of the place, lasting as long as the road. line: x, y [m]. resistance, resistance_std, grade (rise over run
+    along the line), trend (resistance per day): None if unknown. unmeasured: share without resistance. passes_ph,
+    tonnes_ph: per hour; guessed: no machine stated a mass. machines: approximate number. fuel: None if not stated.
     """
 
     id: str
@@ -59,7 +55,7 @@ class RoadSegment:
 
 @dataclass(frozen=True)
 class Segments:
-    """Roads of a map. hours: that the traffic is of. placed: share of all metres driven that lie on a road."""
+    """Roads of a map. hours: of the traffic. placed: share of driven metres on roads."""
 
     store: str
     merged: int
@@ -72,12 +68,11 @@ class Segments:
 
 @dataclass(frozen=True)
 class WorklistRow:
-    """What a stretch costs an hour, over ground of the target's resistance: value, low and high of 90 %.
+    """Hourly cost of a section over target ground: value, low and high of 90 %.
 
-    rank: from 1; stretches that differ by less than the noise have the same. since_ns: since when the ground is so: the
-    first pass after its last change, or the first hour of which its resistance is remembered. before, saved_kwh_ph:
-    resistance before that change, and what it saves an hour (below 0: it became worse); None for no change.
-    day_ns, day_resistance: begins of days with measurements, the oldest first, and the mean resistance of each.
+    rank: from 1; ties within the noise. since_ns: first pass after the ground's last change, or the first remembered
+    hour. before, saved_kwh_ph: resistance before that change, and hourly saving (below 0: worse); None without change.
+    day_ns, day_resistance: measured days, oldest first, with mean resistance.
     """
 
     rank: int
@@ -94,11 +89,10 @@ class WorklistRow:
 
 @dataclass(frozen=True)
 class RoadChange:
-    """A stretch whose ground changed: repaired, or become worse, as two passes in a row showed.
+    """A section that was repaired or became worse, as two passes in a row showed.
 
-    id, line: as of its segment. first_ns: of the first pass that saw it, to the minute; seen_ns: when that was sure.
-    before, after: resistance. saved_kwh_ph: less lost an hour at the target, with the same traffic; below 0 where it
-    is worse. fuel: as of its segment.
+    id, line, fuel: as of its segment. first_ns: first pass after it, to the minute; seen_ns: when certain. before,
+    after: resistance. saved_kwh_ph: at the target, with the same traffic; below 0 if worse.
     """
 
     id: str
@@ -113,9 +107,9 @@ class RoadChange:
 
 @dataclass(frozen=True)
 class Worklist:
-    """Where work on roads pays, as the ground is since its last change.
+    """Sections worth grading, by the ground since its last change.
 
-    total_kwh_ph: of all stretches, in the list or not. changes: the newest first.
+    total_kwh_ph: of all sections, listed or not. changes: newest first.
     """
 
     store: str
@@ -130,7 +124,7 @@ class Worklist:
 
 
 def _said(items: list[tuple[str, object]]) -> dict[str, object]:
-    """Fields of a record, fuel only where it is known."""
+    """Fields of a record, without unknown fuel."""
     return {name: value for name, value in items if name != "fuel" or value is not None}
 
 
@@ -158,8 +152,8 @@ def decode_worklist(data: bytes) -> Worklist:
 class RoadQuery(AsOf[T], Fresh[T]):
     """A query of roads.
 
-    from_ns, to_ns: traffic of the hours that begin in from_ns <= time < to_ns, None for all that is remembered.
-    bounds: segments whose middle lies there. machine: traffic of this one alone, and what it measured; "" for all.
+    from_ns, to_ns: traffic of hours beginning in from_ns <= time < to_ns, None for all remembered. bounds: of segment
+    centres. machine: only its traffic and measurements; "" for all.
     """
 
     from_ns: int | None = asked(STAMP, "from", "traffic of the hours that begin from then on", None)
@@ -179,7 +173,7 @@ class RoadQuery(AsOf[T], Fresh[T]):
 
 @dataclass(frozen=True)
 class SegmentsQuery(RoadQuery[Segments]):
-    """Roads of the map, segment by segment, and what drove on them."""
+    """Roads by segment, with traffic."""
 
     name = "segments"
     help = "roads that the map shows, and what drove on them"
@@ -188,9 +182,9 @@ class SegmentsQuery(RoadQuery[Segments]):
 
 @dataclass(frozen=True)
 class WorklistQuery(RoadQuery[Worklist]):
-    """Where work on roads pays: segments that cost more than ground of a target c_rr would, the dearest first.
+    """Road sections that cost more than ground of the target c_rr, most expensive first.
 
-    efficiency: of engine and drive train, for litres. limit: at most so many.
+    efficiency: of engine and drive train, for litres. limit: of rows.
     """
 
     target: float = asked(SHARE, "target", "rolling resistance of good ground, above 0 and at most 1", 0.02)

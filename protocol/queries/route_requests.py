@@ -1,6 +1,6 @@
-"""Queries for routes as selector parameters (docs/protocol.md, "Routes"): what a line costs, which line costs least.
+"""Route queries as selector parameters (docs/protocol.md, "Routes"): what a line costs, which line costs least.
 
-A query that cannot be answered on any map is refused where it is made, by the name of its parameter.
+Queries that no map can answer are refused at once, by parameter.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MAX_STEPS = 10_000
 ENERGY, TIME = "energy", "time"
 DEAREST, REFUSE = "dearest", "refuse"  # of unknown ground: the cost of the worst tenth nearby, uphill; or no passage
 
-# Parameters of a machine, its attributes, and what they are.
+# Machine parameters: attribute and meaning.
 _VALUES = {
     "mass": ("mass_kg", "with what it carries [kg]"),
     "speed": ("speed_mps", "highest [m/s]"),
@@ -55,7 +55,7 @@ _VALUES = {
 
 
 def _read_machine(given: Parameters) -> RouteMachine | NamedMachine:
-    """A machine by the name of its kind or by its own, with those of its values that are given."""
+    """A kind or a machine's name, with the values given."""
     name = given.get("machine", next(iter(MACHINES)))
     values = {attribute: read_number(key, given[key]) for key, (attribute, _) in _VALUES.items() if key in given}
     if name not in MACHINES and not NAME.fullmatch(name):
@@ -120,9 +120,9 @@ UNKNOWN = ValueKind(
 class LineQuery(AsOf[RouteAnswer], Fresh[RouteAnswer]):
     """A query of lines over the map.
 
-    machine: also one of the site. stops: whether it stands at the begin and at the end. step_m: of the steps that are
-    answered. unknown: what ground that nobody knows is taken for: DEAREST, REFUSE or a rolling resistance coefficient.
-    repairs: roads whose ground changed are read from the samples since.
+    machine: a kind, or one of the site. stops: standing at begin, at end. step_m: of the answer. unknown: unknown
+    ground as DEAREST, REFUSE or a rolling resistance coefficient. repairs: on changed roads, only samples since the
+    change.
     """
 
     machine: RouteMachine | NamedMachine = grouped(_MACHINE, LOADER)
@@ -146,7 +146,7 @@ class LineQuery(AsOf[RouteAnswer], Fresh[RouteAnswer]):
         return self.reads_past or self.repairs
 
     def check_steps(self, length_m: float) -> None:
-        """Refuse a line of too many steps."""
+        """Refuse too many steps."""
         if length_m > self.step_m * MAX_STEPS:
             problem = f"{length_m:.0f} m in steps of {self.step_m:g} m are over {MAX_STEPS}"
             raise refusal("step", problem, Refusal.TOO_LARGE)
@@ -154,7 +154,7 @@ class LineQuery(AsOf[RouteAnswer], Fresh[RouteAnswer]):
 
 @dataclass(frozen=True)
 class RouteQuery(LineQuery):
-    """What a drive along a line [m] costs a machine."""
+    """What driving a line [m] costs a machine."""
 
     line: tuple[Place, ...] = asked(places(), "line", "x,y,x,y,... [m], two places or more")
 
@@ -177,10 +177,9 @@ class RouteQuery(LineQuery):
 
 @dataclass(frozen=True)
 class WayQuery(LineQuery):
-    """The line from one place to another [m] that costs a machine least, and what it costs.
+    """The least expensive line between two places [m], and its cost.
 
-    cost: ENERGY or TIME. max_grade: of ground that it is led over [m/m]. margin_m: how far it stays from ground that it
-    may not be led over, and from the places to avoid.
+    cost: ENERGY or TIME. max_grade: of the ground [m/m]. margin_m: distance from excluded ground and places to avoid.
     """
 
     start: Place = asked(PLACE, "from", "x,y [m]")

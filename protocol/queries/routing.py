@@ -1,4 +1,4 @@
-"""Routes: machines that drive them, and what a drive costs (docs/protocol.md, "Routes")."""
+"""Routes: machines and driving costs (docs/protocol.md, "Routes")."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ MAX_ROTATING = 2.0
 
 @dataclass(frozen=True)
 class RouteMachine:
-    """A machine as a route needs it; the defaults are those of a wheel loader with its bucket full.
+    """A machine for routes; by default a wheel loader with a full bucket.
 
-    mass_kg: with what it carries. speed_mps: its highest. power_w: at the wheels. efficiency: energy at the wheels over
-    that of the fuel, 0 to 1. accelerate_mps2, brake_mps2: as it is driven. lateral_mps2: sideways, in curves. rotating:
-    mass with what rotates with it over mass. ValueError names a value that is not usable.
+    mass_kg: with load. speed_mps: highest. power_w: at the wheels. efficiency: energy at the wheels over fuel energy, 0
+    to 1. accelerate_mps2, brake_mps2: as driven. lateral_mps2: in curves. rotating: mass with rotating parts over mass.
+    ValueError names a bad value.
     """
 
     mass_kg: float = 22_500.0
@@ -57,7 +57,7 @@ class RouteMachine:
 
 
 LOADER = RouteMachine()
-# By the name of their kind, the first one where none is named: typical ones, as the simulator has them.
+# Typical machines by kind, as simulated; the first is the default.
 MACHINES = {
     "loader": LOADER,
     "truck": RouteMachine(mass_kg=47_000.0, power_w=240_000.0, rotating=1.1),
@@ -67,9 +67,9 @@ MACHINES = {
 
 @dataclass(frozen=True)
 class NamedMachine:
-    """A machine of the site, by its name: its mass is what its newest samples state, see docs/protocol.md.
+    """A site's machine by name; its newest samples state its mass, see docs/protocol.md.
 
-    given: attributes of a RouteMachine and their values, by name, which hold whatever is known. ValueError as there.
+    given: overriding attributes of a RouteMachine. ValueError as there.
     """
 
     name: str
@@ -80,18 +80,17 @@ class NamedMachine:
 
 
 def machine_of(named: str) -> RouteMachine | NamedMachine:
-    """A machine by the name of its kind, or by its own."""
+    """A machine by kind or name."""
     return MACHINES.get(named) or NamedMachine(named)
 
 
 @dataclass(frozen=True)
 class RouteSteps:
-    """n steps along a route, in its direction.
+    """Steps along a route, n of them.
 
-    distance_m (n,): from the begin of the route to the end of each; length_m; x_m, y_m: of its begin, in `map`.
-    resistance, slope, their deviations and confidence: means, NaN where nothing is known of them. unknown: share of
-    its length where nobody was; unmeasured: where machines were and none could tell the resistance. energy_j: what
-    drives the wheels; braked_j: what brakes take; speed_mps: mean.
+    distance_m (n,): from the begin to each one's end; x_m, y_m: of its begin, in `map`. resistance, slope, their
+    deviations, confidence: means, NaN if unknown. unknown: share of length never driven; unmeasured: driven without
+    resistance. energy_j: driving the wheels; braked_j: taken by brakes; speed_mps: mean.
     """
 
     distance_m: Floats
@@ -113,13 +112,11 @@ class RouteSteps:
 
 @dataclass(frozen=True)
 class RouteTotals:
-    """All of a route. low, high: its 90 % interval. lift_m: how much higher its end is.
+    """A whole route. low, high: 90 % interval. lift_m: rise from begin to end.
 
-    unknown, unmeasured: shares of its length, as of the steps. unknown_resistance: what its unknown ground was taken
-    for, the mean of it; 0 where none is unknown.
-
-    energy_j: drive force times way. At the wheels it is more by their slip, which the map does not know: 1 to 4 % on
-    firm ground, 10 % in sand. fuel_j: over the machine's efficiency.
+    unknown, unmeasured: shares of length. unknown_resistance: mean assumed for unknown ground, or 0. energy_j: drive
+    force times distance; wheel slip, unknown to the map, adds 1 to 4 % on firm ground, 10 % in sand. fuel_j: energy
+    over efficiency.
     """
 
     length_m: float
@@ -138,15 +135,15 @@ class RouteTotals:
 
     @property
     def litres(self) -> float:
-        """Of diesel, with so much energy."""
+        """Diesel of that energy."""
         return self.fuel_j / DIESEL_J_PER_L
 
 
 @dataclass(frozen=True)
 class RouteAnswer:
-    """What a route costs this machine.
+    """A route's cost for a machine.
 
-    line_m (k, 2): where it leads. stamp_ns: the site's now, or the time that the map is of.
+    line_m (k, 2): its course. stamp_ns: the site's now, or the map's time.
     """
 
     version: MapVersion
@@ -158,7 +155,7 @@ class RouteAnswer:
 
     @property
     def merged(self) -> int:
-        """The last journal row in the map."""
+        """Last merged journal row."""
         return self.version.row
 
 

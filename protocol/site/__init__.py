@@ -1,1 +1,1 @@
-"""The site: its frame, its grid of cells, and the kinds of ground."""
+"""The site: frame, grid, kinds of ground."""

@@ -1,7 +1,7 @@
-"""Grid geometry, in pure functions: cells, blocks, bounds.
+"""Pure grid geometry: cells, blocks, bounds.
 
-Cell (0, 0) has its south-west corner at the origin of `map`; columns grow to the east, rows to the north. Blocks of
-16 x 16 cells are the unit of memory.
+Cell (0, 0) has its south-west corner at the origin of `map`; columns grow east, rows north. 16 x 16 cells are a block,
+the unit of memory.
 """
 
 import math
@@ -12,8 +12,8 @@ import numpy as np
 from protocol.arrays import Floats, Ints
 
 BLOCK_CELLS = 16
-MAX_CELLS = 16_000_000  # of one region query: 64 MB a layer
-SLACK = 1e-9  # cells; a bound on an edge, in floating point, is on the edge
+MAX_CELLS = 16_000_000  # per region query: 64 MB a layer
+SLACK = 1e-9  # rounding tolerance in cells for bounds on an edge
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Bounds:
             raise ValueError("bounds: west must be below east and south below north")
 
     def shared(self, other: "Bounds") -> "Bounds | None":
-        """The rectangle that two have in common; None for none."""
+        """The common rectangle, or None."""
         west_m, south_m = max(self.west_m, other.west_m), max(self.south_m, other.south_m)
         east_m, north_m = min(self.east_m, other.east_m), min(self.north_m, other.north_m)
         return Bounds(west_m, south_m, east_m, north_m) if west_m < east_m and south_m < north_m else None
@@ -41,7 +41,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class CellWindow:
-    """A rectangle of cells: first column and row, number of columns and rows."""
+    """Cells: first column and row, numbers of columns and rows."""
 
     column: int
     row: int
@@ -51,22 +51,22 @@ class CellWindow:
 
 @dataclass(frozen=True)
 class GridGeometry:
-    """How positions map to cells."""
+    """Positions to cells."""
 
     cell_m: float = 1.0
 
     def cell_of(self, position_m: Floats) -> Ints:
-        """Column or row of positions along one axis."""
+        """Column or row of positions on one axis."""
         return np.floor(position_m / self.cell_m).astype(np.int64)
 
     def window(self, bounds: Bounds) -> CellWindow:
-        """Return the smallest window of whole cells that holds the bounds."""
+        """Smallest window of cells around bounds."""
         column, row = (math.floor(v / self.cell_m + SLACK) for v in (bounds.west_m, bounds.south_m))
         end_column, end_row = (math.ceil(v / self.cell_m - SLACK) for v in (bounds.east_m, bounds.north_m))
         return CellWindow(column, row, max(1, end_column - column), max(1, end_row - row))
 
     def bounds(self, window: CellWindow) -> Bounds:
-        """Outer edges of a window [m]."""
+        """Outer edges [m]."""
         return Bounds(
             window.column * self.cell_m,
             window.row * self.cell_m,
@@ -75,5 +75,5 @@ class GridGeometry:
         )
 
     def centres(self, first: int, count: int) -> Floats:
-        """Centres [m] of `count` cells along one axis."""
+        """Centres [m] of `count` cells on one axis."""
         return (np.arange(first, first + count, dtype=np.float64) + 0.5) * self.cell_m

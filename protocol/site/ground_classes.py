@@ -1,4 +1,4 @@
-"""Kinds of ground as the paper distinguishes them: names, coefficients, colours, and the classes of a map's cells."""
+"""The paper's kinds of ground: names, coefficients, colours, and classes of cells."""
 
 import math
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ import numpy as np
 
 from protocol.arrays import AnyArray, Ints
 
-UNKNOWN = -1  # class of a cell without samples
+UNKNOWN = -1  # a cell without samples
 
 
 @dataclass(frozen=True)
 class Zone:
-    """One kind of ground: its rolling resistance coefficient [-] and its colour in the paper's pictures."""
+    """A kind of ground: rolling resistance [-], colour in the paper's pictures."""
 
     name: str
     c_rr: float
@@ -26,26 +26,26 @@ ZONES = (
     Zone("wet dirt", 0.06, (40, 215, 250)),
     Zone("sand", 0.25, (205, 95, 30)),
 )
-BOUNDARIES = (0.014, 0.03, 0.05, 0.155)  # midway between the coefficients of neighbouring zones
+BOUNDARIES = (0.014, 0.03, 0.05, 0.155)  # midway between neighbouring coefficients
 
 FLAT, SLOPE = 0, 1
 SLOPE_LIMIT = math.tan(math.radians(7.5))  # midway between the paper's 0 and 15 degrees
 
 
 def resistance_class(values: AnyArray) -> Ints:
-    """Index into ZONES by resistance coefficient; UNKNOWN where it is not finite. A boundary belongs to the upper."""
+    """Index into ZONES, a boundary going up; UNKNOWN if not finite."""
     classes = np.digitize(np.asarray(values, np.float64), BOUNDARIES)
     return np.where(np.isfinite(values), classes, UNKNOWN).astype(np.int64)
 
 
 def slope_class(east: AnyArray, north: AnyArray) -> Ints:
-    """SLOPE where the gradient vector is steeper than SLOPE_LIMIT, FLAT below; UNKNOWN where it is not finite."""
+    """SLOPE where the gradient exceeds SLOPE_LIMIT, else FLAT; UNKNOWN if not finite."""
     gradient = np.hypot(np.asarray(east, np.float64), np.asarray(north, np.float64))
     return np.where(np.isfinite(gradient), np.where(gradient > SLOPE_LIMIT, SLOPE, FLAT), UNKNOWN).astype(np.int64)
 
 
 def wrong_percent(classes: Ints, truth: Ints) -> float:
-    """Share [%] of the cells known in both whose class differs from the truth (the paper's J); NaN if none is known."""
+    """Share [%] of cells known in both whose class is wrong (the paper's J), or NaN."""
     known = (classes != UNKNOWN) & (truth != UNKNOWN)
     if not known.any():
         return math.nan

@@ -1,7 +1,6 @@
-"""The site: its name, its frame `map` (metres east and north of the origin), and the projection to and from WGS 84.
+"""The site: name, frame `map` (metres east and north of the origin), projection to and from WGS 84.
 
-The frame is a transverse Mercator projection at the origin with scale 1 (docs/design.md): x, y are metres, every export
-has a true coordinate reference system, and all machines share it.
+The frame is a transverse Mercator projection at the origin with scale 1 (docs/design.md), shared by all machines.
 """
 
 import hashlib
@@ -22,7 +21,7 @@ MAX_EXTENT_M = 100_000.0  # of any site
 
 @dataclass(frozen=True)
 class KnownGround:
-    """An area of known rolling resistance, on which machines calibrate themselves. outline: corners in `map` [m]."""
+    """An area of known rolling resistance, for calibration. outline: corners in `map` [m]."""
 
     name: str
     c_rr: float
@@ -35,7 +34,7 @@ class KnownGround:
             raise ValueError(f"outline: {self.name}: {len(self.outline)} corners are no area")
 
     def inside_m(self, x_m: float, y_m: float) -> float:
-        """How far inside of the outline a place lies [m]; negative outside."""
+        """Distance to the outline [m], negative outside."""
         corners = np.array(self.outline)
         sides = np.roll(corners, -1, axis=0) - corners
         off = np.array([x_m, y_m]) - corners
@@ -51,9 +50,8 @@ class KnownGround:
 class SiteConfig:
     """One construction site.
 
-    clock: "data" takes the newest accepted stamp as now, "wall" also refuses stamps beyond the wall clock.
-    extent_m: positions further than this from the origin, east or north, are refused. known_ground: where the rolling
-    resistance is known.
+    clock: "data" takes the newest accepted stamp as now, "wall" also refuses stamps beyond the wall clock. extent_m:
+    bound of positions east or north. known_ground: areas of known rolling resistance.
     """
 
     name: str
@@ -82,7 +80,7 @@ class SiteConfig:
 
     @property
     def crs(self) -> str:
-        """The site frame as a PROJ string."""
+        """The frame as a PROJ string."""
         return (
             f"+proj=tmerc +lat_0={float(self.origin_lat_deg)!r} +lon_0={float(self.origin_lon_deg)!r} "
             "+k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
@@ -90,12 +88,12 @@ class SiteConfig:
 
     @cached_property
     def frame(self) -> str:
-        """Eight hex digits that tell site frames apart; batches carry them, so that frames never mix in one map."""
+        """Frame id of eight hex digits; batches carry it, so frames never mix."""
         return hashlib.sha256(f"{self.crs} {float(self.origin_height_m)!r}".encode()).hexdigest()[:8]
 
     @cached_property
     def geometry(self) -> GridGeometry:
-        """The grid of this site."""
+        """The site's grid."""
         return GridGeometry(self.cell_m)
 
 
@@ -110,10 +108,10 @@ def site_toml(site: SiteConfig) -> str:
 
 
 class Projection:
-    """Latitude, longitude, height to the site frame and back (pyproj; needs the `agent`, `server` or `sim` extra)."""
+    """WGS 84 to the site frame and back (pyproj; extra `agent`, `server` or `sim`)."""
 
     def __init__(self, site: SiteConfig) -> None:
-        from pyproj import Proj  # imported here: the client does not need it
+        from pyproj import Proj  # not needed by the client
 
         self._proj: Any = Proj(site.crs)
         self._height_m = site.origin_height_m
@@ -124,16 +122,16 @@ class Projection:
         return float(x), float(y), height_m - self._height_m
 
     def to_map_many(self, lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
-        """Positions in `map` [m], x and y, of places of one shape (...); infinite where that is impossible."""
+        """Positions x, y [m] of shape (...); infinite if impossible."""
         x, y = self._proj(lon_deg.ravel(), lat_deg.ravel())
         return np.asarray(x).reshape(lat_deg.shape), np.asarray(y).reshape(lat_deg.shape)
 
     def to_geodetic(self, x_m: float, y_m: float, z_m: float = 0.0) -> tuple[float, float, float]:
-        """Latitude and longitude [deg] and height [m]."""
+        """Latitude, longitude [deg], height [m]."""
         lon, lat = self._proj(x_m, y_m, inverse=True)
         return float(lat), float(lon), z_m + self._height_m
 
     def to_geodetic_many(self, x_m: Floats, y_m: Floats, z_m: Floats) -> Floats:
-        """Latitude, longitude [deg] and height [m] of places in `map`, all of one shape (...): (3, ...)."""
+        """Latitude, longitude [deg], height [m] (3, ...) of positions of shape (...)."""
         lon, lat = self._proj(x_m.ravel(), y_m.ravel(), inverse=True)
         return np.stack([lat.reshape(x_m.shape), lon.reshape(x_m.shape), z_m + self._height_m])

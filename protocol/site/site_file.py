@@ -1,4 +1,4 @@
-"""The file of a site (config/site.toml)."""
+"""A site's file (config/site.toml)."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from protocol.site.site_config import SiteConfig
 
 
 def load_site(path: Path) -> SiteConfig:
-    """Read a `site.toml`, or the [site] of a log's manifest."""
+    """Read `site.toml`, or [site] of a log's manifest."""
     table = load_toml(path)
     if isinstance(table.get("site"), dict):
         return from_table(SiteConfig, table["site"], f"{path} [site]")

@@ -1,1 +1,1 @@
-"""What goes over Zenoh: key expressions, messages, their bytes, and sessions."""
+"""Zenoh traffic: key expressions, messages, bytes, sessions."""

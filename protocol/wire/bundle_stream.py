@@ -15,12 +15,12 @@ from protocol.wire.messages import SensorBundle
 
 
 class BundleStream:
-    """The bundles of one machine, counted 1, 2, 3..."""
+    """A machine's bundles, counted 1, 2, 3..."""
 
     def __init__(self, session: zenoh.Session, site: str, machine: str) -> None:
         self.machine = machine
         self._counter = 0
-        # readings must not be dropped when an agent is slow: the sender waits instead
+        # a slow agent delays the sender, and loses no readings
         block = zenoh.CongestionControl.BLOCK
         self._publisher: Any = session.declare_publisher(keys.sensors(site, machine), congestion_control=block)
 
@@ -35,13 +35,13 @@ class BundleStream:
         self._publisher.put(encode_bundle(SensorBundle(self.machine, self._counter, readings, last)))
 
     def close(self) -> None:
-        """Publish the closing bundle and withdraw."""
+        """Publish the last bundle and withdraw."""
         self.put(last=True)
         self._publisher.undeclare()
 
 
 class StreamClock:
-    """Holds the time of readings back to `speed` times the clock's; speed 0 never waits."""
+    """Limits reading time to `speed` times the clock's; 0 for unlimited."""
 
     def __init__(self, speed: float, stop: threading.Event, clock: Callable[[], float]) -> None:
         self._speed, self._stop, self._clock = speed, stop, clock
@@ -49,7 +49,7 @@ class StreamClock:
         self.late_s = 0.0
 
     def wait(self, since_begin_s: float) -> None:
-        """Wait until this time of the readings is due, or the run is stopped."""
+        """Wait until this reading time is due, or a stop."""
         if not self._speed:
             return
         early_s = self._start + since_begin_s / self._speed - self._clock()

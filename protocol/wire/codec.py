@@ -1,4 +1,4 @@
-"""Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong."""
+"""Messages to bytes and back, validated: MessageError names field and row."""
 
 from collections import Counter
 from dataclasses import asdict, replace
@@ -40,8 +40,8 @@ MAX_BATCH_SAMPLES = 20_000
 MAX_BUNDLE_BYTES = 2**20
 MAX_SEQ = 2**62
 MAX_RETRY_S = 3600.0
-MAX_CORRECTIONS_BYTES = 16 * 2**10  # a second of a base with all satellites and signals has some 2 kB
-MOST_VAR = 1.0  # of zero and scale of an offer: more is no knowledge
+MAX_CORRECTIONS_BYTES = 16 * 2**10  # a base with all satellites and signals sends 2 kB a second
+MOST_VAR = 1.0  # of an offer's zero and scale: more is no knowledge
 _WIDTHS = tuple(SAMPLE_DTYPE[name].itemsize for name in COLUMNS)
 _STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value in OPTIONAL.items()}
 
@@ -50,7 +50,7 @@ _STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value
 
 
 def encode_batch(batch: SampleBatch) -> bytes:
-    """Columns of little-endian binary, one per name of SAMPLE_DTYPE; of AIDED and FUEL where they say anything."""
+    """Little-endian columns of SAMPLE_DTYPE; AIDED and FUEL only if informative."""
     is_stated = {AIDED: batch.rows[AIDED].any(), FUEL: np.isfinite(batch.rows[FUEL]).any()}
     names = [name for name in COLUMNS if is_stated.get(name, True)]
     table: dict[str, Any] = {
@@ -69,10 +69,7 @@ def encode_batch(batch: SampleBatch) -> bytes:
 
 
 def decode_batch(data: bytes, extent_m: float) -> SampleBatch:
-    """Decode and check a batch: one bad sample refuses the whole batch, with field and row named.
-
-    extent_m: how far from the origin a position may lie. Unknown columns and fields are ignored.
-    """
+    """Decode and check a batch; one bad sample refuses it. extent_m: bound of positions. Unknown fields are ignored."""
     packed = unpack_batch(data)
     rows = np.empty(packed.n, SAMPLE_DTYPE)
     for name, column in zip(COLUMNS, packed.columns, strict=True):
@@ -82,7 +79,7 @@ def decode_batch(data: bytes, extent_m: float) -> SampleBatch:
 
 
 def unpack_batch(data: bytes) -> PackedBatch:
-    """Check all of a batch but its samples."""
+    """Check a batch except its samples."""
     table = unpack(data, MAX_BATCH_BYTES)
     n = take_int(table, "n", 0, MAX_BATCH_SAMPLES, Refusal.TOO_LARGE)
     first_seq = take_int(table, "first_seq", 1, MAX_SEQ - max(0, n - 1), Refusal.FIRST_SEQ)
@@ -112,7 +109,7 @@ def _columns(cols: dict[str, Any], n: int) -> tuple[bytes, ...]:
 
 
 def encode_reply(reply: Ack | Refused) -> bytes:
-    """The server's answer to a batch."""
+    """The server's reply to a batch."""
     table: dict[str, Any]
     if isinstance(reply, Ack):
         table = {"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed}
@@ -142,7 +139,7 @@ def decode_reply(data: bytes) -> Ack | Refused:
 
 
 def encode_bundle(bundle: SensorBundle) -> bytes:
-    """Readings as columns per sensor."""
+    """Readings as columns by sensor."""
     groups: dict[tuple[str, str], list[Reading]] = {}
     for reading in bundle.readings:
         groups.setdefault((reading.sensor, reading.kind), []).append(reading)
@@ -157,9 +154,9 @@ def _encode_group(sensor: str, kind: str, readings: list[Reading]) -> dict[str, 
 
 
 def decode_bundle(data: bytes) -> SensorBundle:
-    """Decode a bundle; readings in the order of their stamps.
+    """Decode a bundle; readings in stamp order.
 
-    A malformed bundle is refused as a whole; a single implausible reading is skipped and counted in `refused`.
+    A malformed bundle is refused; implausible readings are counted in `refused`.
     """
     table = unpack(data, MAX_BUNDLE_BYTES)
     refused: Counter[str] = Counter()
@@ -202,7 +199,7 @@ def _decode_group(group: dict[str, Any], refused: Counter[str]) -> list[Reading]
 
 
 def encode_pose(pose: Pose) -> bytes:
-    """One live position."""
+    """A live position."""
     return pack({name: getattr(pose, name) for name in Pose.__dataclass_fields__})
 
 
@@ -214,10 +211,7 @@ def decode_pose(data: bytes) -> Pose:
 
 
 def receive_pose(key: str, data: bytes, extent_m: float = MAX_EXTENT_M) -> Pose:
-    """A live position that came in under a key: of the machine that the key names, and as plausible as a sample.
-
-    extent_m: how far from the origin a position may lie.
-    """
+    """Decode a live position and check it against its key and sample limits; extent_m: bound of positions."""
     pose = decode_pose(data)
     if not key.endswith(f"/machine/{pose.machine}/pose"):
         raise MessageError(Refusal.WRONG_MACHINE, f"{pose.machine!r} sends under {key}", field="machine")
@@ -232,14 +226,14 @@ def receive_pose(key: str, data: bytes, extent_m: float = MAX_EXTENT_M) -> Pose:
 
 
 def encode_health(health: Health) -> bytes:
-    """One health report."""
+    """A health report."""
     return pack({"machine": health.machine, "stamp_ns": health.stamp_ns, "values": dict(health.values)})
 
 
 def decode_health(data: bytes) -> Health:
     """Undo `encode_health`."""
     table = unpack(data, MAX_SMALL_BYTES)
-    stamp_ns = take_int(table, "stamp_ns", 0, MAX_STAMP_NS)  # 0: nothing was read yet
+    stamp_ns = take_int(table, "stamp_ns", 0, MAX_STAMP_NS)  # 0 before the first reading
     return Health(take_name(table), stamp_ns, take_plain(table, "values"))
 
 
@@ -247,12 +241,12 @@ def decode_health(data: bytes) -> Health:
 
 
 def encode_corrections(message: Corrections) -> bytes:
-    """What a relay says of its base."""
+    """A relay's message."""
     return pack(vars(message))
 
 
 def decode_corrections(data: bytes, base: str) -> Corrections:
-    """Undo `encode_corrections`; refused where it is of another base than this one."""
+    """Undo `encode_corrections`; refused from another base."""
     table = unpack(data, MAX_CORRECTIONS_BYTES)
     if (sender := take_name(table, "base")) != base:
         raise MessageError(Refusal.OUT_OF_RANGE, f"of {sender}, on the key of {base}", field="base")
@@ -264,12 +258,12 @@ def decode_corrections(data: bytes, base: str) -> Corrections:
 
 
 def encode_offer(offer: CalibrationOffer) -> dict[str, Any]:
-    """The table."""
+    """An offer as a table."""
     return asdict(offer)
 
 
 def decode_offer(table: Any) -> CalibrationOffer:
-    """Undo `encode_offer`; refused where a value is not plausible."""
+    """Undo `encode_offer`; implausible values are refused."""
     if not isinstance(table, dict):
         raise MessageError(Refusal.WRONG_TYPE, f"map expected, not {type(table).__name__}", field="offer")
     names = ("zero", "scale", "zero_var", "scale_var", "covariance")

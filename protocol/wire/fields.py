@@ -1,7 +1,4 @@
-"""Fields of messages: MessagePack with the protocol's version, and each value taken out with its type and limits.
-
-A MessageError names the field that is wrong.
-"""
+"""Message fields: MessagePack with the protocol version; types and limits checked; MessageError."""
 
 import math
 import re
@@ -16,27 +13,27 @@ from protocol.site.site_config import NAME
 from protocol.wire.messages import VERSION
 
 MAX_SMALL_BYTES = 64 * 2**10
-MAX_ITEMS = 1000  # of one list, except in answers: the decoder reserves memory for what a header claims
+MAX_ITEMS = 1000  # per list, except in answers: the decoder reserves memory for claimed sizes
 MAX_DEPTH = 16  # of plain values
 MAX_INT = 2**64 - 1  # of MessagePack
 STORE_ID = re.compile(r"[0-9a-f]{16}")
 
 
 def pack(table: dict[str, Any]) -> bytes:
-    """MessagePack with the protocol's version in front; an integer beyond its 64 bits is the greatest that it has."""
+    """MessagePack with the version first; integers are capped at 64 bits."""
     packed: bytes = msgpack.packb({"v": VERSION, **table}, default=_fitting)
     return packed
 
 
 def _fitting(value: Any) -> int:
-    """A sum of what machines say that they lost may be any number: it must not keep all others from being read."""
+    """Cap sums of claimed losses, so that the others remain readable."""
     if type(value) is int and value > MAX_INT:
         return MAX_INT
     raise TypeError(f"{type(value).__name__} is no value of MessagePack")
 
 
 def unpack(data: bytes, limit: int, items: int = MAX_ITEMS) -> dict[str, Any]:
-    """Undo `pack`; refuses what is too long, no MessagePack map, or of another version. items: most in one list."""
+    """Undo `pack`; refuses what is too long, no map, or another version. items: most per list."""
     if len(data) > limit:
         raise MessageError(Refusal.TOO_LARGE, f"{len(data)} bytes, at most {limit} are allowed")
     try:
@@ -51,7 +48,7 @@ def unpack(data: bytes, limit: int, items: int = MAX_ITEMS) -> dict[str, Any]:
 
 
 def take(table: dict[str, Any], name: str, kind: type[Any], default: Any = None) -> Any:
-    """Take one field of the given type; a default makes it optional."""
+    """Take a field of a type; a default makes it optional."""
     value: Any = table.get(name, default)
     if value is None:
         raise MessageError(Refusal.MISSING_FIELD, "missing", field=name)
@@ -65,7 +62,7 @@ def take(table: dict[str, Any], name: str, kind: type[Any], default: Any = None)
 
 
 def check_plain(value: Any, field: str, depth: int = MAX_DEPTH) -> None:
-    """Refuse what is no plain value: bytes, MessagePack's own types, and tables deeper than `depth`."""
+    """Refuse bytes, MessagePack types, and nesting beyond `depth`."""
     if depth < 0:
         raise MessageError(Refusal.WRONG_TYPE, f"nested more than {MAX_DEPTH} deep", field=field)
     if isinstance(value, dict):
@@ -81,14 +78,14 @@ def check_plain(value: Any, field: str, depth: int = MAX_DEPTH) -> None:
 
 
 def take_plain(table: dict[str, Any], name: str) -> dict[str, Any]:
-    """Take a map of plain values, which can be shown as they are."""
+    """Take a map of plain values, fit to show."""
     values: dict[str, Any] = take(table, name, dict)
     check_plain(values, name)
     return values
 
 
 def take_int(table: dict[str, Any], name: str, low: int, high: int, reason: Refusal = Refusal.OUT_OF_RANGE) -> int:
-    """Take an integer between two limits, both allowed."""
+    """Take an integer, limits included."""
     value: int = take(table, name, int)
     if not low <= value <= high:
         raise MessageError(reason, f"{value} is not between {low} and {high}", field=name)
@@ -104,7 +101,7 @@ def take_name(table: dict[str, Any], field: str = "machine") -> str:
 
 
 def take_store(table: dict[str, Any], name: str = "store", *, optional: bool = False) -> str:
-    """Take the id of a store; empty where it is optional and missing."""
+    """Take a store id; empty if optional and missing."""
     text: str = take(table, name, str, "" if optional else None)
     if not STORE_ID.fullmatch(text) and (text or not optional):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{text[:40]!r} is no id of a store", field=name)
@@ -117,13 +114,13 @@ def take_stamp(table: dict[str, Any]) -> int:
 
 
 def check(holds: bool, field: str, problem: str, reason: Refusal = Refusal.OUT_OF_RANGE) -> None:  # noqa: FBT001
-    """Refuse a field about which something does not hold."""
+    """Refuse a field if a condition fails."""
     if not holds:
         raise MessageError(reason, problem, field=field)
 
 
 def inflated(data: bytes, size: int, field: str, row: int | None = None) -> bytes:
-    """Inflate bytes (zlib) of a field, which are `size` then; more are never made."""
+    """Inflate a field (zlib) of exactly `size` bytes; never more."""
     stream = zlib.decompressobj()
     try:
         plain = stream.decompress(data, size + 1)

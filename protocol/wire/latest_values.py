@@ -1,4 +1,4 @@
-"""What was heard of machines, by name. Names are free where there are no keys: they are few, and make room."""
+"""Latest values by machine name. Without keys, names are unchecked: their number is bounded."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 MOST_NAMES = 1000
-SILENT_S = 60.0  # a name that was silent for so long makes room for another one; agents speak every second
+SILENT_S = 60.0  # silence after which a name makes room; agents speak every second
 
 
 class LatestValues(Generic[T]):
-    """Values by name, and when each was heard last [s of the clock]; not for several threads at once."""
+    """Values by name and time heard [s of the clock]; not thread-safe."""
 
     def __init__(self, clock: Callable[[], float], most: int = MOST_NAMES) -> None:
         self._clock, self._most = clock, most
-        self._values: OrderedDict[str, tuple[T, float]] = OrderedDict()  # the one that is silent longest comes first
+        self._values: OrderedDict[str, tuple[T, float]] = OrderedDict()  # longest silent first
 
     def hear(self, name: str, value: T) -> bool:
-        """Keep what was heard last; False, and nothing is kept, where all places have names that spoke lately."""
+        """Keep a value; False if all places have names heard lately."""
         now_s = self._clock()
         if name not in self._values and len(self._values) >= self._most:
             oldest, (_, heard_s) = next(iter(self._values.items()))
@@ -31,12 +31,12 @@ class LatestValues(Generic[T]):
         return True
 
     def get(self, name: str) -> T | None:
-        """What was heard last; None for a name that has no place."""
+        """The latest value, or None."""
         value = self._values.get(name)
         return value[0] if value else None
 
     def items(self) -> list[tuple[str, T, float]]:
-        """Names, values, and when they were heard."""
+        """Names, values, times heard."""
         return [(name, *item) for name, item in self._values.copy().items()]
 
     def __len__(self) -> int:

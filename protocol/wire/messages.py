@@ -1,4 +1,4 @@
-"""The messages of the wire as frozen records. `codec.py` turns them into bytes and back; docs/protocol.md specifies."""
+"""Wire messages as frozen records. `codec.py` converts them; docs/protocol.md specifies them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,11 +13,10 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class SampleBatch:
-    """Samples first_seq, first_seq + 1, ... of one spool.
+    """Samples first_seq, first_seq + 1, ... of a spool; an empty batch asks for the watermark.
 
-    frame: the site frame of the positions (`SiteConfig.frame`). lost_before: how many samples directly before
-    first_seq the bounded spool dropped. An empty batch asks for the watermark. store: id of the store that has
-    acknowledged earlier samples of the spool, empty where none has.
+    frame: of the positions (`SiteConfig.frame`). lost_before: samples dropped directly before first_seq. store: id of
+    the store that acknowledged earlier samples, or empty.
     """
 
     machine: str
@@ -30,13 +29,13 @@ class SampleBatch:
 
     @property
     def last_seq(self) -> int:
-        """Sequence number of the last sample."""
+        """Seq of the last sample."""
         return self.first_seq + len(self.rows) - 1
 
 
 @dataclass(frozen=True)
 class PackedBatch:
-    """A batch as it came in. batch: without its samples; n: how many; columns: theirs, in the order of COLUMNS."""
+    """A received batch. batch: without samples; n: their number; columns: theirs, in the order of COLUMNS."""
 
     batch: SampleBatch
     n: int
@@ -45,10 +44,9 @@ class PackedBatch:
 
 @dataclass(frozen=True)
 class CalibrationOffer:
-    """What the map server takes off the newest samples of a machine, counted from what it measured.
+    """The map server's correction of a machine's newest samples, relative to its raw measurement.
 
-    zero, scale: as a sample states them. zero_var, scale_var, covariance: of what is left. stamp_ns: the site's now
-    when that was decided.
+    zero, scale: as in samples. zero_var, scale_var, covariance: of the rest. stamp_ns: the site's now at the decision.
     """
 
     machine: str
@@ -64,10 +62,9 @@ class CalibrationOffer:
 class Ack:
     """Everything up to `watermark` is on the server's disk.
 
-    row: the journal row; trimmed: samples it had already. store: id of the server's store; replaces: that of the batch,
-    where it is another one, whose place this store takes. offer: a table of `CalibrationOffer`, or None; it is not
-    checked with the acknowledgement, which holds whatever is offered. epoch: number of the server among all that ever
-    wrote the store, 0 where it has none; of two acknowledgements that contradict each other, the higher one counts.
+    row: journal row; trimmed: samples it already had. store: the server's; replaces: the batch's store, which this one
+    replaces. offer: unchecked table of `CalibrationOffer`, or None: the acknowledgement holds anyway. epoch: number of
+    the server among the store's writers, or 0; in contradictions the higher counts.
     """
 
     watermark: int
@@ -81,10 +78,9 @@ class Ack:
 
 @dataclass(frozen=True)
 class Refused:
-    """The server did not take a batch. expected: the next sequence number it would take, 0 where that is not known.
+    """A batch was not taken. expected: next acceptable seq, 0 if unknown.
 
-    retry_after_s: when there may be room for it again; 0 where that is not known, or not what keeps it out.
-    reason, problem: one line each; characters that cannot be printed are escaped.
+    retry_after_s: when there may be room, 0 if unknown or irrelevant. reason, problem: one line each, escaped.
     """
 
     reason: str
@@ -99,21 +95,18 @@ class Refused:
 
 @dataclass(frozen=True)
 class SensorBundle:
-    """Readings of one machine over a short span. counter: 1, 2, 3... per stream; last: the stream ends here."""
+    """A machine's readings over a short span. counter: 1, 2, 3... per stream; last: its end."""
 
     machine: str
     counter: int
     readings: tuple[Reading, ...]
     last: bool = False
-    refused: Mapping[str, int] = field(default_factory=dict)  # readings skipped when decoding, by reason
+    refused: Mapping[str, int] = field(default_factory=dict)  # skipped when decoding, by reason
 
 
 @dataclass(frozen=True)
 class Corrections:
-    """What a relay has of a base. stamp_ns: when the newest frame came. frames: of RTCM3, whole, end to end.
-
-    problem: what keeps frames from coming, in a sentence; empty where nothing does.
-    """
+    """A relay's message. stamp_ns: newest frame. frames: whole RTCM3, end to end. problem: why none come, or ""."""
 
     base: str
     stamp_ns: int
@@ -123,7 +116,7 @@ class Corrections:
 
 @dataclass(frozen=True)
 class Pose:
-    """Live position of a machine in `map`."""
+    """A machine's live position in `map`."""
 
     machine: str
     stamp_ns: int
@@ -138,7 +131,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Health:
-    """The health report of one agent. values: nested tables of plain values."""
+    """An agent's health. values: nested tables of plain values."""
 
     machine: str
     stamp_ns: int

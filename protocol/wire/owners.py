@@ -1,8 +1,8 @@
-"""Who has a name on the network: a question that a live process answers, and no dead one.
+"""Who holds a name on the network: a question that only live processes answer.
 
-A liveliness token would be there until the router believes that its process is gone, up to the lease of a broken link.
-(A router passes nothing between two sessions in peer mode: of two agents that both started without a router, neither
-sees the other. Their samples have different identities all the same, see agents/delivery/spool.py.)
+A liveliness token outlives its process until the router notices, up to a broken link's lease. (Routers pass nothing
+between two peer sessions: agents that started without a router do not see each other. Their samples still have
+different identities, see agents/delivery/spool.py.)
 """
 
 import os
@@ -18,8 +18,8 @@ import zenoh
 from protocol.errors import MessageError
 from protocol.wire.fields import MAX_SMALL_BYTES, pack, take, unpack
 
-ANSWER_S = 1.0  # how long to wait for answers
-# Every process but this one, each with its own answer.
+ANSWER_S = 1.0  # wait for answers
+# All other processes, each with its own answer.
 EVERY_OTHER: Any = {
     "target": zenoh.QueryTarget.ALL,
     "consolidation": zenoh.ConsolidationMode.NONE,
@@ -29,7 +29,7 @@ EVERY_OTHER: Any = {
 
 @dataclass(frozen=True, order=True)
 class Owner:
-    """One running process. Of two with one name, the lesser one keeps it: the earlier, then by chance."""
+    """A running process. The lesser of two with one name keeps it: the earlier, then by chance."""
 
     started_ns: int
     token: int
@@ -41,24 +41,24 @@ class Owner:
 
 
 def this_process(now_ns: Callable[[], int] = time.time_ns) -> Owner:
-    """The owner that this process is if it starts now."""
+    """The current process as an owner starting now."""
     return Owner(now_ns(), secrets.randbits(62), socket.gethostname(), os.getpid())
 
 
 def encode_owner(owner: Owner, **more: Any) -> bytes:
-    """An answer to who it is."""
+    """Answer to who it is."""
     return pack(asdict(owner) | more)
 
 
 def decode_owner(data: bytes) -> tuple[Owner, dict[str, Any]]:
-    """Undo `encode_owner`: the owner, and all fields of the answer."""
+    """Undo `encode_owner`: owner and all fields."""
     table = unpack(data, MAX_SMALL_BYTES)
     fields = (("started_ns", int), ("token", int), ("host", str), ("pid", int))
     return Owner(*(take(table, name, kind) for name, kind in fields)), table
 
 
 def owner_of(reply: zenoh.Reply) -> Owner | None:
-    """Who has answered; None where that cannot be read."""
+    """Who answered; None if unreadable."""
     try:
         return decode_owner(reply.ok.payload.to_bytes() if reply.ok else b"")[0]
     except MessageError:

@@ -1,4 +1,4 @@
-"""Zenoh sessions as this project uses them: no scouting, and no shared memory, which can drop queries."""
+"""Zenoh sessions without scouting or shared memory, which can drop queries."""
 
 import json
 import os
@@ -15,19 +15,18 @@ from protocol.wire.credentials import Credentials
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_TLS_ENDPOINT = "tls/127.0.0.1:7447"
 _SYSTEM_ERROR = re.compile(r"([^:\[\]()]+) \(os error \d+\)")
-# What keeps a router from stopping for one link:
+# Keeps one link from blocking a router:
 ROUTER = {
-    # What waits for a link that does not read [batches of 64 kB]: a whole piece of a region, so that it stops no other.
+    # Queue of a link that does not read [64 kB batches]: a whole piece of a region, so that it blocks no other.
     "transport/link/tx/queue/size/data": 16,
-    # Beyond that, everything else that comes from the same sender stands still, until the link is closed [us]. Zenoh's
-    # 5 s are longer than an agent waits for its acknowledgement.
+    # Beyond it the sender's other traffic stops until the link is closed [us]. Zenoh's 5 s exceed an agent's timeout.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
-    # Links that open and say nothing: with Zenoh's 100 at a time and 10 s for each, 100 keep all others out for 10 s.
-    "transport/unicast/accept_pending": 500,  # of 1024 files that a process usually may open
-    "transport/unicast/accept_timeout": 3000,  # [ms]; four small messages, also over a link of 64 kbit/s
+    # Silent new links: with Zenoh's limits, 100 of them lock out others for 10 s.
+    "transport/unicast/accept_pending": 500,  # of usually 1024 open files per process
+    "transport/unicast/accept_timeout": 3000,  # [ms]: four small messages at 64 kbit/s
 }
-# Closing a link that takes no more bytes blocks its thread in the kernel for 10 s (Zenoh sets SO_LINGER), and with
-# Zenoh's two threads two such links stop all others.
+# Closing a stuck link blocks a kernel thread for 10 s (Zenoh sets SO_LINGER); with Zenoh's two threads, two such links
+# would stop everything.
 THREADS = "(rx: (worker_threads: 64), net: (worker_threads: 8))"
 
 
@@ -35,9 +34,8 @@ THREADS = "(rx: (worker_threads: 64), net: (worker_threads: 8))"
 class SessionConfig:
     """How a process joins the network.
 
-    mode: "client" connects to a router; "router" is the site's router and listens. wait_s: how long to wait for the
-    router; negative opens at once and goes on looking for it in the background, as an agent does. credentials: for
-    mutual TLS; None for links without encryption. guard: the router's rules, as settings of Zenoh.
+    mode: "client", or "router", which listens. wait_s: for the router; negative opens at once and looks for it in the
+    background. credentials: for mutual TLS, or None. guard: the router's rules as Zenoh settings.
     """
 
     endpoint: str = DEFAULT_ENDPOINT
@@ -60,7 +58,7 @@ class SessionConfig:
 
 
 def open_session(config: SessionConfig) -> zenoh.Session:
-    """Open a session; LinkError if the router cannot be reached, or the address not be listened on, in time."""
+    """Open a session; LinkError if router or listening address is unavailable in time."""
     settings = zenoh.Config()
     try:
         for key, value in _settings(config).items():
@@ -71,7 +69,7 @@ def open_session(config: SessionConfig) -> zenoh.Session:
 
 
 def reason_of(error: zenoh.ZError) -> str:
-    """What Zenoh says, without the places in its sources and the errors around the cause."""
+    """Zenoh's message without source locations and nested errors."""
     text = str(error).partition("\n")[0]
     if of_system := _SYSTEM_ERROR.search(text):
         return of_system[1].strip().lower()
@@ -80,7 +78,7 @@ def reason_of(error: zenoh.ZError) -> str:
 
 
 def _aim(config: SessionConfig) -> str:
-    """What failed, and the likely reasons: a link that is refused looks like one that is not there."""
+    """What failed and why: a refused link looks like a missing one."""
     if config.mode == "router":
         return "listen here: end the router that does, or choose another --listen"
     if config.credentials:
@@ -101,7 +99,7 @@ def _settings(config: SessionConfig) -> dict[str, object]:
         settings["transport/link/tls"] = config.credentials.tls(listens=config.mode == "router")
     if config.mode == "router":
         return {**settings, **ROUTER, "listen/endpoints": [config.endpoint], **config.guard}
-    # A client's open blocks until the router is there; a peer that listens nowhere connects in the background.
+    # A client's open waits for the router; a peer that listens nowhere connects in the background.
     in_background = config.wait_s < 0
     wait_ms = -1 if in_background else int(config.wait_s * 1000)
     return settings | {
@@ -115,19 +113,19 @@ def _settings(config: SessionConfig) -> dict[str, object]:
 
 
 def use_many_threads() -> None:
-    """Let links of this process not wait for each other; before its first session."""
+    """Keep this process's links from blocking each other; before its first session."""
     os.environ.setdefault("ZENOH_RUNTIME", THREADS)
 
 
 def free_endpoint() -> str:
-    """Return an endpoint on loopback whose port is free now."""
+    """A loopback endpoint with a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def is_free(port: int) -> bool:
-    """Whether nobody listens at a port on loopback."""
+    """Whether a loopback port is free."""
     with socket.socket() as trial:
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
