@@ -98,7 +98,7 @@ def _known(pages: TimedPages, tuning: ChangeTuning) -> Known:
 
 
 def _derived(pages: TimedPages, what: object, by: object, derive: Callable[[], T]) -> T:
-    """What `derive` makes, the last time that it was made by this configuration, which is compared and not hashed."""
+    """Result of `derive`, cached for one configuration, which is compared, not hashed."""
     kept = pages.derived.get(what)
     if kept is None or kept[0] != by:
         kept = pages.derived[what] = by, derive()

@@ -143,7 +143,7 @@ def evidence(pages: Sequence[TimedPages], first: Sequence[Ints] | None = None) -
 
 
 def plane_counts(pages: Sequence[TimedPages], planes: slice) -> Ints:
-    """Counts (blocks, planes, 256) of some planes, of all pages together: quicker than all that there is of them."""
+    """Counts (blocks, planes, 256) of some planes, over all pages; a shortcut."""
     out = np.zeros((len(pages), planes.stop - planes.start, ev.CELLS), np.int64)
     for data, counts in zip([as_numbers(each.record) for each in pages], out, strict=True):
         sum_planes(data, planes.start, counts)

@@ -32,9 +32,9 @@ class MergeWaits:
         self._lock = threading.Lock()
 
     def add(self, row: int, wait_s: float, then: Then) -> bool:
-        """Have `then` called once the row is merged, or with an error after wait_s; False if it is merged already.
+        """Call `then` once the row is merged, or with an error after wait_s; False if it is merged already.
 
-        It is called on the thread that merges or times out, and has to be short. QueryError if too many are waiting.
+        It runs on the thread that merges or times out, so it must be short. QueryError if too many wait.
         """
         with self._lock:
             if row <= self._merged:
@@ -47,7 +47,7 @@ class MergeWaits:
             return True
 
     def advance(self, merged: int) -> None:
-        """Note merged rows, and call back whoever waits for them."""
+        """Note merged rows, and call back."""
         with self._lock:
             self._merged = merged
             due = self._taken(lambda wait: wait.row <= merged) if merged >= self._next_row else []
@@ -55,7 +55,7 @@ class MergeWaits:
             wait.then(None)
 
     def time_out(self) -> float:
-        """Call back whose wait is over; returns how long until the next one is [s], infinite for none."""
+        """Call back after timeouts; returns the time until the next one [s], or inf."""
         with self._lock:
             now_s = time.monotonic()
             due = self._taken(lambda wait: wait.deadline_s <= now_s)

@@ -154,7 +154,7 @@ class Answers:
         return {**info, "counters": counters, "checkpoints": self._source.past.checkpoints.state, **names}
 
     def point(self, query: PointQuery) -> PointAnswer:
-        """Layers of the cell that a position lies in."""
+        """Layers of the cell at a position."""
         names, place = _names(query), np.array([(query.x_m, query.y_m)])
         if not query.reads_past and (kept := self._source.run(lambda state: self._kept_point(state, place, names))):
             return kept
@@ -163,7 +163,7 @@ class Answers:
         return PointAnswer(float(one.x_m[0]), float(one.y_m[0]), values, one.version, one.stamp_ns)
 
     def _kept_point(self, state: MapState, place: Floats, names: tuple[str, ...]) -> PointAnswer | None:
-        """Layers of a cell of the map as it is, where they are kept."""
+        """Layers of a cell of the present map, if cached."""
         (cell,) = self._site.geometry.cell_of(place)
         values = self._layers.kept_cell(state, tuple(cell.tolist()), names)
         if values is None:
@@ -172,11 +172,11 @@ class Answers:
         return PointAnswer(x_m, y_m, values, state.version, state.newest_ns)
 
     def points(self, query: PointsQuery) -> PointsAnswer:
-        """Layers of the cells that positions lie in."""
+        """Layers of the cells at positions."""
         return self._at(np.array(query.places), _names(query), query)
 
     def _at(self, places: Floats, names: tuple[str, ...], query: Compared[Any]) -> PointsAnswer:
-        """Layers of the cells that places (n, 2) lie in, less those of another time where the query says so."""
+        """Layers of the cells at places (n, 2), minus those of another time if the query asks for it."""
         cells = self._site.geometry.cell_of(places)
         looks = (self._look_at_cells(cells, names, as_of_ns, repairs=query.repairs) for as_of_ns in query.times)
         (layers, look), *others = looks

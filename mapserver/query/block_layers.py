@@ -50,10 +50,10 @@ NO_AGES = b""
 
 
 class Kept(NamedTuple):
-    """Layers of one block or square, the state in which they are good, and what they were derived from.
+    """Layers of a block or square, and the state in which they are valid.
 
-    origin: of a block, its own last turn, and where its pages begin to count (256,), empty for all of them; of a
-    square, the numbers of the blocks around it. number: of what a block was derived from, another one for another.
+    origin: of a block, its last turn and first valid pages (256,), if not all; of a square, the numbers of its blocks.
+    number: identifies an origin.
     """
 
     state: State
@@ -440,7 +440,7 @@ def around_squares(squares: Set[Block]) -> CellWindow:
 
 
 def _around_all(blocks: Iterable[Block]) -> Rect:
-    """The rectangle that has all of these blocks or squares."""
+    """Smallest rectangle around blocks or squares."""
     columns, rows = zip(*blocks, strict=True)
     left, bottom = min(columns), min(rows)
     return left, bottom, max(columns) - left + 1, max(rows) - bottom + 1
@@ -530,5 +530,5 @@ def _by_square(image: Floats, rect: Rect, squares: Set[Block]) -> dict[Block, in
 
 
 def place_square(out: Mapping[str, Floats32], window: CellWindow, square: Block, layers: Layers) -> None:
-    """Copy layers (64, 64) of a square into those of a window."""
+    """Copy layers (64, 64) of a square into a window."""
     place(out, window, (square[0] * SQUARE, square[1] * SQUARE), layers)

@@ -29,22 +29,22 @@ from protocol.queries.answers import MapVersion
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, Plane, TilesAnswer, TilesQuery
 from protocol.site.geometry import BLOCK_CELLS
 
-LAYERS = (*list(PLANES)[:-1], "newest_ns")  # which `since` follows from
-AT_ONCE = 64  # tiles that are looked at together: 1024 blocks, which take whoever owns the map some 10 ms
-TILE_HEAD_BYTES = 64  # of a tile beside its planes, at most
+LAYERS = (*list(PLANES)[:-1], "newest_ns")  # `since` follows from it
+AT_ONCE = 64  # tiles looked at together: 1024 blocks, 10 ms of the map's owner
+TILE_HEAD_BYTES = 64  # upper bound, besides the planes
 NOTHING = MapVersion("", 0, -1)
 Place = tuple[int, int]  # column and row of a tile
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A tile in the making: planes (planes, 64, 64), and the newest stamps (64, 64), 0 for none."""
+    """An unfinished tile: planes (planes, 64, 64), and newest stamps (64, 64), 0 for none."""
 
     planes: Plane = field(default_factory=lambda: np.zeros((len(PLANES), TILE_CELLS, TILE_CELLS), np.uint8))
     newest_ns: Ints = field(default_factory=lambda: np.zeros((TILE_CELLS, TILE_CELLS), np.int64))
 
     def tile(self, place: Place, version: MapVersion) -> MapTile:
-        """The tile as it is drawn."""
+        """The finished tile."""
         newest = int(self.newest_ns.max())
         since_s = np.where(self.newest_ns > 0, (newest - self.newest_ns) / 1e9, np.nan)
         self.planes[-1] = PLANES["since"].quantised(since_s)
@@ -53,7 +53,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """What is drawn: of a turn of a grid, a version, with ages; and the number of what each block is drawn from."""
+    """State of the tiles: turn of a grid, version and ages drawn, and the origin of each block."""
 
     turn: int = -1
     grid: ReferenceType[Grid] | None = None  # a fact may bring another one
@@ -77,7 +77,7 @@ class Tiles:
         self._drawn = _Drawn()
 
     def answer(self, query: TilesQuery) -> TilesAnswer:
-        """Tiles that differ since the version that the query names; all where it names none of this store."""
+        """Tiles that differ since the query's version; all for none of this store."""
         with self._lock:
             version, stamp_ns = self._update()
             since = query.since
@@ -88,13 +88,10 @@ class Tiles:
             return cut(TilesAnswer(version, stamp_ns, self._cell_m, whole, tiles), query.place)
 
     def _update(self) -> tuple[MapVersion, int]:
-        """Draw anew what evidence came into, and what lies so near that a change of the ground there counts for it.
-
-        Whatever fails on the way is drawn with the next question: what is drawn is noted at the end.
-        """
+        """Redraw tiles with new evidence in or near them. The state is noted last, so a failure is retried."""
         ages = self._lately()
         places, drawn, stamp_ns = self._source.run(lambda state: self._changed(state, ages))
-        if drawn.version.row < self._drawn.version.row:  # rows are gone: what was said of them differs from no version
+        if drawn.version.row < self._drawn.version.row:  # rows are gone: earlier versions cannot be compared
             self._tiles = {}
         whole = drawn.drawings is not self._drawn.drawings
         for some in _few(sorted({*places, *(self._tiles if whole else ())})):
@@ -104,7 +101,7 @@ class Tiles:
             gone = {place: drawn.drawings.setdefault(place, Drawing()) for place in (some if whole else ())}
             for place, drawing in (gone | draw(drawn.drawings, others)).items():
                 known, made = self._tiles.get(place), drawing.tile(place, drawn.version)
-                # what evidence came into is another one, though its bytes are not: `Client.watch` reads finer values
+                # new evidence makes a new tile, even with equal bytes: `Client.watch` reads finer values
                 if not (whole and known and (known.newest_ns, known.planes) == (made.newest_ns, made.planes)):
                     self._tiles[place] = made
             drawn.numbers.update((block, kept.number) for block, kept in others.items())
@@ -112,7 +109,7 @@ class Tiles:
         return drawn.version, stamp_ns
 
     def _changed(self, state: MapState, ages: Ages) -> tuple[set[Place], _Drawn, int]:
-        """Tiles that may be others, and what they are to be drawn from."""
+        """Tiles that may change, and the state to draw them from."""
         grid, last = state.grid, self._drawn
         whole = state.version.fact != last.version.fact or last.grid is None or last.grid() is not grid
         folded, turn = grid.folded_since(-1 if whole else last.turn)
@@ -151,12 +148,12 @@ def _is_same(some: Ages, others: Ages, block: Block) -> bool:
 
 
 def of_tiles(layers: BlockLayers, look: Look, places: Iterable[Place]) -> dict[Block, Kept]:
-    """The blocks of tiles that have evidence."""
+    """Blocks of tiles with evidence."""
     return layers.blocks(look, [block for place in places for block in _blocks(place)], LAYERS)
 
 
 def draw(drawings: dict[Place, Drawing], blocks: Mapping[Block, Kept]) -> dict[Place, Drawing]:
-    """Draw blocks; returns the drawings that they are of."""
+    """Draw blocks; returns the drawings touched."""
     drawn: dict[Place, Drawing] = {}
     if not blocks:
         return drawn

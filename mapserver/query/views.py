@@ -180,7 +180,7 @@ def read_lanes(
 
 
 def place(out: Mapping[str, Floats32], window: CellWindow, block: Block, layers: Mapping[str, AnyArray]) -> None:
-    """Copy layers of a square of blocks, whose first one this is, into those of a window; (256,) of one block alone."""
+    """Copy layers of a square of blocks, given its first one, into a window; (256,) for one block."""
     if not layers:
         return
     n = math.isqrt(next(iter(layers.values())).size)
