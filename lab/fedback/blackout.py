@@ -1,4 +1,4 @@
-"""Machines that lose GPS, in the full filter: errors with another day's lanes, and without."""
+"""Errors of machines without GPS in the full filter, with another day's lanes and without."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ INSIDE = 5.991  # normalised squared error at the 95 % ellipse
 
 @dataclass(frozen=True)
 class Lost:
-    """A machine without GPS for a while. other: seed of the day of its lanes, -1: none."""
+    """A machine without GPS for a while. other: seed of its lanes' day, -1: none."""
 
     machine: str
     other: int = -1
@@ -43,9 +43,9 @@ class Lost:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors (n, 2) and covariances (n, 2, 2) of the live pose, once a second.
+    """Live pose, each second: errors (n, 2), covariances (n, 2, 2).
 
-    after_s (n,): since GPS was lost. true_m (n, 2): true position.
+    after_s (n,): since loss of GPS. true_m (n, 2): position.
     """
 
     after_s: Floats
@@ -73,7 +73,7 @@ def lanes_of(seed: int, seconds: float, cache: Path) -> LaneMap:
 
 
 def localise(folder: Path, name: str, lanes: LaneMap | None) -> Errors:
-    """Errors of a machine with these lanes from the start, and GPS lost later."""
+    """Errors with lanes from the start and GPS lost later."""
     log = open_log(folder / "logs" / name)
     config = LocalisationConfig(map_aid="auto" if lanes else "off")
     core = Positioning(log.site, with_receivers(log.machine, 2), PipelineConfig(localisation=config))
@@ -100,7 +100,7 @@ Courses = Mapping[bool, Sequence[Errors]]  # with lanes, without
 
 
 def courses_of(runner: Runner, turns: Sequence[tuple[int, int]], seconds: float) -> Courses:
-    """All machines of each turn's second day, with the first day's lanes and without."""
+    """All machines on each turn's second day, with and without the first day's lanes."""
     courses: dict[bool, list[Errors]] = {}
     for aided in (True, False):
         drives = [(first, day("driven", second, seconds)) for first, second in turns]

@@ -14,13 +14,13 @@ OUTER: Corners = ((20, 16), (180, 16), (184, 130), (100, 134), (16, 130))
 APART_M = 6.0  # between the two lanes of case `two`
 FREE_CORNERS = 8  # of a machine's route on a day of free driving
 ROUNDING_M = 8.0
-CROSSED_RAD = (0.0, 0.7, 1.57, 2.4)  # angles of rectangles that all cross each other
+CROSSED_RAD = (0.0, 0.7, 1.57, 2.4)  # angles of mutually crossing rectangles
 CROSSED_M = (52.0, 18.0)  # half their sides
 
 
 @dataclass(frozen=True)
 class Site:
-    """A site of four machines. base: scenario. model, preset, speed: of its machines. fixed: days repeat."""
+    """Four machines. base: scenario. model, preset, speed: of the machines. fixed: days repeat."""
 
     name: str
     base: str
@@ -81,7 +81,7 @@ def day(site: str, seed: int, seconds: float, world: str | None = "fast") -> Day
 
 
 def _ways(site: str, seed: int) -> dict[str, Corners]:
-    """Machine routes that replace the scenario's."""
+    """Machine routes replacing the scenario's."""
     if site == "free":
         return free_ways(seed)
     if site == "crossings":
@@ -98,7 +98,7 @@ def free_ways(seed: int) -> dict[str, Corners]:
 
 
 def _within(corners: Corners, by_m: float) -> Corners:
-    """A rectangle's corners moved inwards equally on each side."""
+    """A rectangle's corners, equally inset."""
     x, y = np.array(corners).T
     toward = np.stack([np.sign(x.mean() - x), np.sign(y.mean() - y)], axis=1)
     toward[np.abs(x - x.mean()) < 10, 0] = 0.0

@@ -1,4 +1,4 @@
-"""The second day on the first day's map and vice versa, against the same drives without a map."""
+"""Each of two days on the other's map, against the same drives without a map."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ REPEATED = ("loading", "haul", "two", "both", "crossings", "free")
 
 @dataclass(frozen=True)
 class FedbackCase:
-    """A site of `days`, a map of `maps`, and the number of receivers used.
+    """A site of `days`, a map of `maps`, receivers in use.
 
-    map: or `row`: each day on all days before; or `lost`: machines lose GPS.
+    map `row`: each day on all earlier ones; `lost`: loss of GPS.
     """
 
     site: str
@@ -58,7 +58,7 @@ Figures = Mapping[str, Floats]  # by machine
 def run(
     runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[FedbackCase] = CASES
 ) -> tuple[Report, Courses]:
-    """Record, localise once, filter again with each map; a row per case, and courses without GPS.
+    """Record, localise once, rerun with each map; a row per case, and courses without GPS.
 
     Seeds are used in pairs.
     """
@@ -102,9 +102,9 @@ def _rows(drives: Drives) -> Rows:
 
 
 def figures_of_day(case: FedbackCase, first: Drives, second: Drives, seconds: float) -> tuple[Figures, Counter[str]]:
-    """Figures of the second day's machines with and without map, and counts of windows.
+    """The second day's figures by machine, with and without map; counts of windows.
 
-    A growing map contains positions that it aided; as many reruns as reads include all of these.
+    A growing map holds positions it aided; as many reruns as reads include them all.
     """
     rows, own, young = days_ago(_rows(first), 1), _rows(second), case.map in GROWING
     begin_ns = int(min(nodes.stamp_ns[0] for nodes in second.values()))
@@ -125,9 +125,9 @@ def _compared(drives: Drives, without: Mapping[str, Course], aided: Mapping[str,
 
 
 def _row_of_days(days: Sequence[Drives]) -> list[Row]:
-    """Each day on the map of all earlier days, themselves aided by lanes; a row per day from the second.
+    """Each day on the map of all earlier, themselves lane-aided days; a row per day from the second.
 
-    offset_m: mean error of all machines of a day, the direction in which a map could run away.
+    offset_m: mean error of all machines of a day, the mode in which a map could drift.
     """
     known: list[tuple[str, Any]] = []
     out: list[Row] = []
@@ -171,7 +171,7 @@ def _figures(nodes: Nodes, course: Course, named: str = "") -> dict[str, float]:
 
 
 def _row(case: FedbackCase, days: Sequence[Figures], counts: Sequence[Counter[str]]) -> Row:
-    """Errors pooled over days and machines; ratios to those without map: overall, 95th percentile, worst, by day."""
+    """Errors pooled over days and machines; ratios to no map: overall, 95th percentile, worst, by day."""
     row: Row = {"case": case.name, "days": len(days)}
     for what in ("live", "smoothed"):
         aided, without = (np.array([figures[f"{name}{what}_m2"] for figures in days]) for name in ("", "without_"))

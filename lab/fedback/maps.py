@@ -1,4 +1,4 @@
-"""Lane maps by the map server's own fold and layer, and harmful ones: displaced lanes, unrepeated lanes."""
+"""Lane maps by the map server's fold and layer, some harmful: displaced or unrepeated lanes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def lane_map(rows: Iterable[tuple[str, Table]]) -> LaneMap:
 
 
 def moved(rows: Rows, left_m: float = 0.0, east_m: float = 0.0, from_x_m: float = -1e9) -> Rows:
-    """Samples moved left of their heading, and east; left only beyond from_x_m, fading in over 10 m."""
+    """Samples shifted left of the heading, and east; left only beyond from_x_m, fading in over 10 m."""
     out = []
     for name, table in rows:
         table, heading = table.copy(), table["heading_rad"].astype(float)
@@ -51,7 +51,7 @@ def moved(rows: Rows, left_m: float = 0.0, east_m: float = 0.0, from_x_m: float 
 
 
 def turned(rows: Rows) -> Rows:
-    """The same routes driven in the opposite direction by others."""
+    """The same routes in the opposite direction, by others."""
     out = []
     for name, table in rows:
         table = table.copy()
@@ -61,7 +61,7 @@ def turned(rows: Rows) -> Rows:
 
 
 def days_ago(rows: Rows, days: int) -> Rows:
-    """The same on an earlier day: all recordings start at one stamp."""
+    """An earlier day's: all recordings start at one stamp."""
     out = []
     for name, table in rows:
         table = table.copy()
@@ -76,7 +76,7 @@ def renamed(rows: Rows, ending: str) -> Rows:
 
 
 def along(lines: Iterable[Floats], stamp_ns: int, draw: np.random.Generator, spacing_m: float = 0.5) -> Rows:
-    """Samples along lines (k, 2), points spacing_m apart, each by a machine with slow 1 m errors."""
+    """Samples spacing_m apart on lines (k, 2), a machine each, with slow 1 m errors."""
     out = []
     for number, line in enumerate(lines):
         rows = empty(len(line))
@@ -93,7 +93,7 @@ def along(lines: Iterable[Floats], stamp_ns: int, draw: np.random.Generator, spa
 
 
 def crossing(count: int, draw: np.random.Generator) -> list[Floats]:
-    """Straight lines across the site in any direction."""
+    """Straight lines across the site."""
     lines = []
     for _ in range(count):
         middle, angle = draw.uniform((40, 30), (160, 120)), draw.uniform(0, 2 * np.pi)
@@ -109,7 +109,7 @@ def free(seed: int, laps: int = 2) -> list[Floats]:
 
 @dataclass(frozen=True)
 class Scene:
-    """Input of maps. rows: another day; own: the judged day, both by machine; begin_ns: its start."""
+    """Input of maps, by machine. rows: another day; own: the judged day; begin_ns: its start."""
 
     rows: Rows
     own: Rows
@@ -122,13 +122,13 @@ class Scene:
         return lambda _: lambda __: lanes
 
     def moves(self, left_m: float) -> MapsOf:
-        """Roads of the eastern half seem displaced from half time on."""
+        """The eastern roads seem displaced from half time on."""
         before, after = lane_map(self.rows), lane_map(moved(self.rows, left_m, from_x_m=EAST_M))
         half_ns = self.begin_ns + round(self.seconds / 2 * 1e9)
         return lambda _: lambda stamp_ns: before if stamp_ns < half_ns else after
 
     def grows(self, names: Callable[[str], Sequence[str]]) -> MapsOf:
-        """Map of the same day from nothing, by the machines in names(machine), read periodically."""
+        """Map of the same day by the machines in names(machine), growing from nothing, read periodically."""
         kept: dict[tuple[Sequence[str], int], LaneMap | None] = {}
 
         def maps_of(name: str) -> Maps:

@@ -1,4 +1,4 @@
-"""A drive as summed up by our filter, so that it can be filtered again with more measurements.
+"""A drive reduced by our filter, for filtering again with more measurements.
 
 Between nodes, a second apart, the smoother sums readings (`agents/localisation/filters/smoother.py`): Phi, the adjoint
 a, the information I; P is the covariance at the first node. The error xi of node k is
@@ -6,8 +6,8 @@ a, the information I; P is the covariance at the first node. The error xi of nod
     seen by the readings up to node k + 1 with information J = I (1 - P I)^-1 and vector j = (1 - I P)^-1 a
     xi_{k+1} = A (xi_k - P a) + w,  w ~ N(0, W)     A = Phi (1 - P I)^-1,  W = P_{k+1} - A (P - P I P) A^T
 
-A rerun with more measurements at nodes takes a thirtieth of the time and is exact to first order. It does not hold
-without GPS, where the gains are deliberately suboptimal (`considers`).
+A rerun with measurements added at nodes is 30 times as fast and exact to first order, but invalid without GPS, where
+the gains are deliberately suboptimal (`considers`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from sim.recorder import TRACKS_FOLDER
 from sitegrid.proof.tracks import read_track
 
 EVERY_M = 0.5  # sample spacing
-TAKEN = 10  # readings at a time: some hundredths of a second
+TAKEN = 10  # readings per step: some hundredths of a second
 
 
 Segments = tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats]  # x, P, A, W, J, j, shift
@@ -38,11 +38,11 @@ Segments = tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats]  # x, P
 
 @dataclass(frozen=True)
 class Nodes:
-    """Beliefs at n nodes, and the information of the readings between them.
+    """Beliefs at n nodes, and the readings' information between them.
 
-    stamp_ns: (n,). x: (n, s), P: (n, s, s). A, W, J: (n - 1, s, s), j, shift: (n - 1, s), shift = P a. true_m: (n, 2),
-    true position. way_ns: (k,), way: (k, 4) by dead reckoning, x, y [m], angle [rad], distance [m]. rows: final
-    samples, positions only. ahead_m: of the load centre.
+    stamp_ns: (n,). x: (n, s), P: (n, s, s). A, W, J: (n - 1, s, s), j, shift: (n - 1, s), shift = P a. true_m: (n, 2)
+    position. way_ns: (k,), way: (k, 4) by dead reckoning: x, y [m], angle [rad], distance [m]. rows: final samples,
+    positions only. ahead_m: of the load centre.
     """
 
     stamp_ns: Ints
@@ -62,7 +62,7 @@ class Nodes:
 
 @dataclass(frozen=True)
 class Machine:
-    """One machine of a day, and its number of receivers used."""
+    """One machine of a day, with this number of receivers."""
 
     machine: str
     receivers: int = 2
@@ -83,7 +83,7 @@ EXPERIMENT = Experiment("fedback", Nodes, solve)
 
 
 class _Watched:
-    """A filter that records its belief at the end of each second."""
+    """A filter recording its belief each second."""
 
     def __init__(self, engine: Filter) -> None:
         self.engine = engine
@@ -99,14 +99,14 @@ class _Watched:
 
 
 def with_receivers(machine: MachineConfig, count: int) -> MachineConfig:
-    """The machine with only its first `count` GPS receivers."""
+    """The machine with its first `count` GPS receivers."""
     gps = [sensor.name for sensor in machine.sensors if sensor.kind == "gps"]
     sensors = (replace(s, use=s.use and s.name not in gps[count:]) for s in machine.sensors)
     return replace(machine, sensors=tuple(sensors))
 
 
 def watch(folder: Path, who: Machine) -> Nodes:
-    """Localise one machine of a recording and record the filter's nodes."""
+    """The filter's nodes of one recorded machine."""
     name = who.machine
     log = open_log(folder / "logs" / name)
     core = Positioning(log.site, with_receivers(log.machine, who.receivers), PipelineConfig())

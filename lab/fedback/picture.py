@@ -1,4 +1,4 @@
-"""Picture of a machine without GPS: its ellipse shrinks at each bend that matches a lane."""
+"""Picture of a machine without GPS, whose ellipse shrinks at each bend on a lane."""
 
 from __future__ import annotations
 

@@ -26,9 +26,9 @@ Maps = Callable[[int], LaneMap | None]  # an agent's map at a stamp
 
 @dataclass(frozen=True)
 class Course:
-    """Errors (n, 2) and covariances (n, 2, 2) at nodes, live and smoothed; counts: outcomes of windows.
+    """Nodes, live and smoothed: errors (n, 2), covariances (n, 2, 2); counts: outcomes of windows.
 
-    shares (n,): part of the smoothed position that came from lanes.
+    shares (n,): the lanes' part in the smoothed position.
     """
 
     live_m: Floats
@@ -41,7 +41,7 @@ class Course:
 
 
 class _Smoother:
-    """Nodes in the lag, joint with the state: mean (q, 3), covariance (q, 3, 3), cross-covariance (q, 3, s)."""
+    """Nodes in the lag and the state, jointly: mean (q, 3), covariance (q, 3, 3), cross-covariance (q, 3, s)."""
 
     def __init__(self, states: int, offset_m2: float) -> None:
         """offset_m2: prior variance of the map's offset, 0: not a state; held: least share of positions."""
@@ -58,13 +58,13 @@ class _Smoother:
         self.C = np.concatenate([self.C[keep], P[None, KEPT]])
 
     def inform(self, vector: Floats, information: Floats, moved: Floats) -> None:
-        """Apply information (s, s) and vector (s,) on the state, which then moves by (s, s)."""
+        """Apply information (s, s) and vector (s,) on the state, then its motion (s, s)."""
         self.mean = self.mean + self.C @ vector
         self.P = self.P - self.C @ information @ self.C.transpose(0, 2, 1)
         self.C = self.C @ moved.T
 
     def all(self) -> tuple[Floats, Floats, Floats]:
-        """Positions (n, 2), covariances (n, 2, 2), shares (n,) of all nodes so far."""
+        """All nodes so far: positions (n, 2), covariances (n, 2, 2), shares (n,)."""
         shares = map(self._share, self.C)
         means, covariances, aided = zip(*self.final, *zip(self.mean, self.P, shares, strict=True), strict=True)
         return np.array(means)[:, :2], np.array(covariances)[:, :2, :2], np.array(aided)
@@ -74,7 +74,7 @@ class _Smoother:
 
 
 def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -> Course:
-    """Rerun the filter. aids: False: the original filter."""
+    """Rerun the filter. aids False: the original one."""
     n = nodes.x.shape[1]
     states = n + 3 * aids
     window, guards, counts = Window(nodes.ahead_m), Guards(), Counter[str]()
@@ -122,7 +122,7 @@ def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -
 
 
 def placed_again(nodes: Nodes, without: Course, aided: Course) -> Table:
-    """A drive's samples at lane-aided positions, with the lanes' share; without: the rerun without lanes."""
+    """Samples at lane-aided positions with the lanes' share; without: the rerun without lanes."""
     rows, moved_m = nodes.rows.copy(), aided.smoothed_m - without.smoothed_m
     for axis, name in enumerate(("x_m", "y_m")):
         rows[name] += np.interp(rows["stamp_ns"], nodes.stamp_ns, moved_m[:, axis])

@@ -1,4 +1,4 @@
-"""Recordings of a machine's bus, decoded by the agent's driver."""
+"""Recordings of a machine's bus, by the agent's driver."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from sitegrid.convert.receivers import sensor_of, unstated
 from sitegrid.convert.recording import Topic, Value
 from sitegrid.setup.hearing_bus import heard_bus
 
-# Alternatives: the first stream with values is taken, the others are offered.
+# Alternatives: the first with values is taken, the others offered.
 ALIKE = (("rear_speed", "speed"), ("gearbox", "clutch"))
 
 
 class BusRecording:
-    """A file of CAN frames, one topic per stream with values."""
+    """CAN frames in a file, one topic per stream with values."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

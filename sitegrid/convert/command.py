@@ -1,4 +1,4 @@
-"""One recording into one log folder, with a report: sensors, contents, and what is left to do by hand."""
+"""One recording into one log folder, with a report of sensors, contents and manual work left."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from sitegrid.times import iso
 
 Takes = Sequence[tuple[str, tuple[str, ...]]]
 NONE = "none"  # kind that takes nothing of a topic
-NOT_STATED = 1.0  # variance for limit checks where none is stated
+NOT_STATED = 1.0  # variance for limit checks if none is stated
 BODY = "[machine]: mass, wheels and the like are those of a wheel loader of 17.5 t: write those of this machine"
 
 
 @dataclass
 class Sensor:
-    """One file of the log folder while it is written.
+    """A file of the log folder being written.
 
-    source: topic, with joints. rows: written. back: stamped before an earlier row. unstated: without a variance.
+    source: topic, with joints. back: rows stamped before an earlier one. unstated: rows without a variance.
     """
 
     topic: Topic
@@ -54,7 +54,7 @@ class Sensor:
     first_refused: dict[str, str] = field(default_factory=dict)
 
     def take(self, value: Value) -> bool:
-        """Whether a value is a reading; counts it either way."""
+        """Count a value; returns whether it is a reading."""
         named = list(zip(columns(self.kind), value.values, strict=not value.problem))
         try:
             if value.problem:
@@ -103,9 +103,9 @@ def run(arguments: Namespace) -> int:
 
 
 def convert(file: Path, folder: Path, takes: Takes = ()) -> dict[str, Any]:
-    """Write a recording's log folder; returns what was taken, omitted, and left to do by hand.
+    """Write a recording's log folder; returns what was taken, omitted, and is left to do.
 
-    takes: topics and the kinds taken of each. Raises ConfigError, LogFolderError, OSError.
+    takes: kinds by topic. Raises ConfigError, LogFolderError, OSError.
     """
     if folder.exists():
         raise ConfigError(folder, "exists, and stays as it is: name another folder, or remove it")
@@ -132,7 +132,7 @@ def convert(file: Path, folder: Path, takes: Takes = ()) -> dict[str, Any]:
 
 
 def open_recording(file: Path) -> Recording:
-    """Open a recording of any type; LogFolderError if it is none."""
+    """Open a recording of any type; otherwise LogFolderError."""
     is_folder = (file / "metadata.yaml").is_file()
     if not is_folder and not file.is_file():
         raise LogFolderError(file, "is neither a file nor the folder of a bag of ROS 2, with metadata.yaml")
@@ -154,7 +154,7 @@ def _head(file: Path) -> bytes:
 
 
 def choose(topics: Sequence[Topic], takes: Takes) -> tuple[list[Sensor], list[str]]:
-    """Sensors to write, and omitted topics with reasons; ConfigError if somebody must choose."""
+    """Sensors to write, and reasons by omitted topic; ConfigError if somebody must choose."""
     asked = [(topic, source, kind) for source, kinds in takes for topic, kind in _asked(topics, source, kinds)]
     named = {split_joints(source)[0] for source, _ in takes}
     chosen, left, open_questions = list(asked), list[str](), list[str]()
@@ -227,12 +227,12 @@ def _site(name: str, fix: Sequence[float], file: Path) -> SiteConfig:
 
 
 def _name(folder: Path) -> str:
-    """A valid name for site, machine and log, from the folder's."""
+    """The folder's name made valid for site, machine and log."""
     return re.sub("[^a-z0-9_-]+", "-", folder.absolute().name.lower()).strip("-_")[:63] or "recording"
 
 
 def _config(sensor: Sensor) -> tuple[SensorConfig, list[str]]:
-    """A sensor of the manifest, and notes on its source and what is left to do."""
+    """The manifest's sensor, and notes on its source and manual work."""
     topic, kind = sensor.topic, sensor.kind
     lacks = {"steering": "wheelbase_m", **dict.fromkeys(BEFORE_THE_WHEELS, "powertrain")}.get(kind, "")
     is_useless = bool(lacks) or sensor.unstated == sensor.rows

@@ -12,7 +12,7 @@ from sitegrid.convert.recording import Topic, Value
 
 
 class GpxRecording:
-    """Points of all tracks; routes and waypoints were not driven."""
+    """Points of all tracks; routes and waypoints are plans."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -32,7 +32,7 @@ class GpxRecording:
 
 
 def _points(path: Path) -> Iterator[Element]:
-    """Track points, one in memory at a time."""
+    """Track points, streamed."""
     try:
         for _, element in iterparse(path):  # noqa: S314 - expat from 2.4.1 on stops entities that multiply
             name = element.tag.rpartition("}")[2]

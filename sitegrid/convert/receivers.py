@@ -18,7 +18,7 @@ UNSTATED_STD = 1e3  # marks unstated variances: decoders drop values without one
 
 
 class ReceiverRecording:
-    """A file of receiver bytes. If several NMEA talkers state positions, each has its own topics."""
+    """Receiver bytes in a file; separate topics for NMEA talkers if several state positions."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -36,7 +36,7 @@ class ReceiverRecording:
         self.unread = [f"{name}: only {heard.kind} is" for name in heard.messages if not name.startswith(heard.kind)]
 
     def values(self, wanted: Collection[tuple[str, str]]) -> Iterator[Value]:
-        """Values of streams; broken or timeless messages are counted in `unread`."""
+        """Values of streams; `unread` counts broken and timeless messages."""
         topics = {f"s{i}": topic for i, (topic, _) in enumerate(wanted)}
         line = Line(self._format, {topic: sensor_of(f"s{i}", kind) for i, (topic, kind) in enumerate(wanted)})
         for piece in _pieces(self._path):
@@ -60,7 +60,7 @@ class ReceiverRecording:
 
 
 def sensor_of(name: str, kind: str) -> SensorConfig:
-    """A sensor that takes values with or without variance."""
+    """A sensor for values with or without variance."""
     is_stating = any(column.startswith("var_") for column in columns(kind))
     return SensorConfig(name, kind, std=dict.fromkeys(QUANTITIES[kind][-1:] if is_stating else (), UNSTATED_STD))
 

@@ -1,4 +1,4 @@
-"""Interface of recordings: topics that can feed sensors, and their values in recorded order."""
+"""Interface of recordings: topics for sensors, and their values in recorded order."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from typing import NamedTuple, Protocol
 class Topic:
     """A stream of a recording.
 
-    kinds: sensor kinds it can feed, with the fields and units taken. sure: taken by default. question: why somebody
-    must choose. joints: parts for `TOPIC[a,b]`. frame: of the measurement; empty: not stated. measures: as of a sensor.
-    note: caveat if taken.
+    kinds: possible sensor kinds, with fields and units. sure: taken by default. question: why somebody must choose.
+    joints: parts for `TOPIC[a,b]`. frame: of the measurement; empty: unstated. measures: as of a sensor. note: caveat.
     """
 
     name: str
@@ -28,7 +27,7 @@ class Topic:
 
 
 class Value(NamedTuple):
-    """One message as a kind of reading. values: its columns, unstated variances 0. problem: why it is no reading."""
+    """A message as a reading. values: its columns, unstated variances 0. problem: why it is none."""
 
     topic: str
     kind: str
@@ -38,7 +37,7 @@ class Value(NamedTuple):
 
 
 class Recording(Protocol):
-    """unread: what is not read, and why, a phrase each; complete after all values."""
+    """unread: what is not read and why, a phrase each; complete after all values."""
 
     topics: list[Topic]
     unread: list[str]

@@ -18,7 +18,7 @@ WHOSE = "the wheels' speed, a receiver's, or a filter's"
 
 
 class RosRecording:
-    """A bag. Types follow ROS' own definitions; a bag's may be anything."""
+    """A bag, by ROS' own type definitions; a bag's may be anything."""
 
     def __init__(self, path: Path, *, is_ros1: bool) -> None:
         self._path, self._is_ros1 = path, is_ros1
@@ -27,7 +27,7 @@ class RosRecording:
         self.topics = list(self._guarded(self._survey()))
 
     def values(self, wanted: Collection[tuple[str, str]]) -> Iterator[Value]:
-        """Values of topics and of joints, `TOPIC[joint,joint]`; unstamped ones have the recorder's time."""
+        """Values of topics and joints, `TOPIC[joint,joint]`; unstamped ones at the recorder's time."""
         return self._guarded(self._values(wanted))
 
     def _values(self, wanted: Collection[tuple[str, str]]) -> Iterator[Value]:
@@ -75,7 +75,7 @@ class RosRecording:
             yield reader
 
     def _messages(self, bag: Any, connections: Sequence[Any]) -> Iterator[tuple[Any, int, Any]]:
-        """Connection, recorder's time [ns], message. No connections give nothing, where rosbags would give all."""
+        """Connection, recorder's time [ns], message. Nothing without connections, where rosbags gives all."""
         read = getattr(_types(self._is_ros1), "deserialize_ros1" if self._is_ros1 else "deserialize_cdr")
         for connection, recorded_ns, data in bag.messages(connections=connections) if connections else ():
             yield connection, recorded_ns, read(data, connection.msgtype)

@@ -9,7 +9,7 @@ from typing import Any
 from protocol.machine.machine_config import SensorConfig
 
 Values = tuple[float, ...]
-TICKS_PER_RAD = SensorConfig.ticks_per_rev / math.tau  # wheel angles as ticks, possibly fractional
+TICKS_PER_RAD = SensorConfig.ticks_per_rev / math.tau  # wheel angles in possibly fractional ticks
 NOT_MEASURED = -1.0  # first element of an unknown covariance
 JOINT_STATE = "sensor_msgs/msg/JointState"
 MOST_JOINTS = {"encoder": 2, "articulation": 1, "steering": 1}
@@ -54,7 +54,7 @@ def _velocity(message: Any, _: Sequence[str]) -> Values:
 
 
 def _twist(message: Any) -> tuple[Any, Sequence[float]]:
-    """The velocity, and its covariance (36,), 0 if the type has none."""
+    """Velocity and covariance (36,), 0 if the type has none."""
     covariance: Sequence[float] = (0.0,) * 36
     while hasattr(message, "twist"):
         covariance, message = getattr(message, "covariance", covariance), message.twist
@@ -83,7 +83,7 @@ _TWIST: _Takes = {
     "gps_velocity": ("twist linear.x east, linear.y north [m/s], covariance [m2/s2]", _velocity),
 }
 _TICKS = _joints("position", lambda angles: (angles[0] * TICKS_PER_RAD, angles[-1] * TICKS_PER_RAD))
-# By type and kind: fields taken, and the conversion of a message and chosen joints; ValueError: no reading.
+# By type and kind: fields, and conversion of a message and chosen joints; ValueError: no reading.
 TYPES: dict[str, _Takes] = {
     "sensor_msgs/msg/NavSatFix": {"gps": ("latitude, longitude [deg], altitude [m], position_covariance [m2]", _fix)},
     "sensor_msgs/msg/Imu": {

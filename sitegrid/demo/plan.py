@@ -1,4 +1,4 @@
-"""The demo's plan: what runs, its files, and its processes, a `sitegrid` command each."""
+"""The demo's plan: files and processes, a `sitegrid` command each."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from sitegrid.pictures.draw import TrackRecorder, draw
 from sitegrid.process.children import Child, Children, wait_until
 from sitegrid.proof.delivery import audit_store
 
-READY_S = 120.0  # silence after which a process counts as hung
+READY_S = 120.0  # silence of a hung process
 LOG_SPEED = 20.0  # times real time
 SIM_OPTIONS = ("scenario", "world", "machines", "seed", "seconds", "speed")  # passed on by the demo
 
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """One demo. out, work: folders of pictures, of all else. configs: a file per machine. log: replayed too."""
+    """out, work: folders of pictures, of all else. configs: a file per machine. log: replayed too."""
 
     out: Path
     work: Path
@@ -54,7 +54,7 @@ class DemoPlan:
 
 
 def make_plan(arguments: Namespace) -> DemoPlan:
-    """Plan from options; clears an earlier run's folder and writes the machines' configurations."""
+    """Plan from options; empties an earlier run's folder and writes the machines' configurations."""
     try:
         config = SimConfig(**{name: getattr(arguments, name) for name in SIM_OPTIONS})
     except ValueError as error:
@@ -68,7 +68,7 @@ def make_plan(arguments: Namespace) -> DemoPlan:
 
 
 def _emptied(work: Path) -> Path:
-    """Empty an earlier run's folder; ConfigError if it is anything else."""
+    """Empty an earlier run's folder; ConfigError for any other."""
     if work.exists() and any(work.iterdir()) and not (work / "site.toml").exists():
         raise ConfigError(work, "is not of an earlier demo, and would be emptied; choose another --out")
     shutil.rmtree(work, ignore_errors=True)
@@ -77,7 +77,7 @@ def _emptied(work: Path) -> Path:
 
 
 def start_server(plan: DemoPlan, children: Children, name: str, site_file: Path) -> Child:
-    """Start a map server; it is ready some seconds later."""
+    """Start a map server, ready some seconds later."""
     store = plan.work / ("store" if name == "server" else f"store-{name}")
     words = ("server", "--endpoint", plan.endpoint, "--site-file", site_file, "--store", store)
     return children.start(name, *words)
@@ -105,7 +105,7 @@ def start_sim(plan: DemoPlan, children: Children) -> Child:
 
 
 class LogReplay:
-    """A real log, replayed by its own agent, site and map server."""
+    """A log replayed by its own agent, site and map server."""
 
     def __init__(self, plan: DemoPlan, log: LogFolder, children: Children) -> None:
         assert plan.manifest is not None

@@ -32,7 +32,7 @@ SAMPLES_FOLLOW = f"the map starts to fill after {LocalisationConfig().lag_s:g} s
 
 
 def run(arguments: Namespace, stop: threading.Event, display: Display) -> int:
-    """Run the demo; returns 1 if a sample was lost or counted twice, or a child failed."""
+    """Run the demo; returns 1 on lost or doubled samples or a failed child."""
     began_s = time.monotonic()
     plan = make_plan(arguments)
     if not arguments.json:
@@ -68,7 +68,7 @@ def run(arguments: Namespace, stop: threading.Event, display: Display) -> int:
 
 
 def stays(arguments: Namespace) -> bool:
-    """Whether the page stays open at the end: on request, or on a terminal, which has Ctrl-C."""
+    """Whether the page stays open at the end: by option, or on a terminal, which has Ctrl-C."""
     return arguments.stay or (arguments.web and not arguments.json and sys.stderr.isatty())
 
 
@@ -110,7 +110,7 @@ def _watch(
     children: tuple[Child, dict[str, Child]],
     control: tuple[threading.Event, Display],
 ) -> None:
-    """Show progress and redraw the map until the machines stop; KeyboardInterrupt if stopped."""
+    """Show progress and the map until the machines stop; KeyboardInterrupt if stopped."""
     (sim, agents), (stop, display) = children, control
     simulated_s, next_picture_s = 0.0, time.monotonic() + 3
     display.begin("machines drive")
@@ -163,7 +163,7 @@ def _report(
     pictures: list[str],
     log: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """The report as a table. rmse_m: position error by machine. log: the replayed log's report."""
+    """The report. rmse_m: position error by machine. log: the replayed log's."""
     whole, driven = scores
     log_lost, log_double = (log["lost"], log["double"]) if log else (0, 0)
     return {

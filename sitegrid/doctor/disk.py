@@ -1,4 +1,4 @@
-"""Files and disks of this host: spool, store, free space."""
+"""Files and disks: spool, store, free space."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TAIL_ROWS = 20_000  # journal rows that a restart folds in seconds
 
 
 def free_bytes(path: Path) -> int:
-    """Free space for a file or folder that need not exist."""
+    """Free space for a file or folder, existing or not."""
     place = path.absolute()
     while not place.is_dir():
         place = place.parent
@@ -51,7 +51,7 @@ class InUseError(StoreError):
 
 @dataclass(frozen=True)
 class SpoolState:
-    """A spool at rest. gone: samples lost by its disk. oldest_ns: oldest sample's stamp, 0: none.
+    """A spool at rest. gone: samples lost by its disk. oldest_ns: stamp, 0: none.
 
     damage: of its write-ahead log, empty: none.
     """
@@ -79,7 +79,7 @@ def read_spool(path: Path) -> SpoolState:
 
 
 def _read_only(path: Path) -> str:
-    """URI that writes nothing: without a write-ahead log no files are made beside a spool."""
+    """URI that creates no file beside a spool: immutable without a write-ahead log."""
     log = path.with_name(f"{path.name}-wal")
     at_rest = not log.exists() or log.stat().st_size == 0
     return f"{path.absolute().as_uri()}?mode=ro" + ("&immutable=1" if at_rest else "")
@@ -99,7 +99,7 @@ def _spool_state(path: Path, db: sqlite3.Connection, traces: Traces) -> SpoolSta
 
 
 def check_spool(state: SpoolState, now_ns: int) -> Finding:
-    """Depth, oldest age, and permanent losses."""
+    """Depth, age, permanent losses."""
     age_s = (now_ns - state.oldest_ns) * 1e-9 if state.oldest_ns else 0.0
     message = f"{state.depth} samples wait" + (f", the oldest is of {_ago(age_s)}" if state.oldest_ns else "")
     message += f"; {state.dropped} were dropped, {state.quarantined} quarantined"
@@ -117,7 +117,7 @@ def check_spool(state: SpoolState, now_ns: int) -> Finding:
 
 
 def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
-    """A running agent, by its health report; other versions may send any values."""
+    """A running agent's health report, which other versions may fill with any values."""
     spool, status = table_of(values, "spool"), status_of(values)
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
     waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
@@ -131,10 +131,10 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
 
 @dataclass(frozen=True)
 class StoreState:
-    """A store. snapshot_row, snapshot_age_s: of the newest snapshot; 0 and infinity without one.
+    """A store. snapshot_row, snapshot_age_s: of the newest snapshot; 0 and infinity without.
 
-    shortfall: acknowledged samples now missing in its files, one line, or empty. missing: those found by earlier
-    starts, by machine. checkpoint_bytes: of all checkpoints.
+    shortfall: acknowledged samples now missing in its files, a line or empty. missing: those found by earlier starts,
+    by machine. checkpoint_bytes: of all checkpoints.
     """
 
     site: str
@@ -188,7 +188,7 @@ def read_store(folder: Path, now_s: float, url: str = "") -> StoreState:
 
 
 def check_store(state: StoreState, site: SiteConfig | None) -> Finding:
-    """Whose store it is, and how long a restart takes."""
+    """Its owner and its restart time."""
     rows = f"{state.last_row} rows of {state.machines} machines, {state.archived_row} archived"
     tail = state.last_row - state.snapshot_row
     snapshot = f"snapshot of row {state.snapshot_row}, {_ago(state.snapshot_age_s)}" if state.snapshot_row else ""

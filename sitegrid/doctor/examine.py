@@ -1,6 +1,6 @@
 """Examination of this host's part of a site, in order, as far as options name it.
 
-Positions are judged by a running agent's health: what fixes confirm, refute, or cannot show.
+Positions are judged by a running agent's health: confirmed, refuted or unobservable by fixes.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ ASKS_MAP = ("machine", "visitor", "admin")  # roles that may query the map (docs
 # Checks that need the map server.
 OF_SERVER = ("server", "losses", "clock", "time", "writer", "followers", "version", "machines", "permission")
 REFUTED = "fixes are further off than the filter expects: look at the variance that the receiver states, and at mounts"
-MISSTATED = 2.25  # actual over stated variance: errors 1.5 times as large, beyond chance
+MISSTATED = 2.25  # actual over stated variance beyond chance: errors 1.5 times as large
 UNSEEN = "a slow GPS error that is larger than stated would not show: there is one receiver, or several that err alike"
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The subject, as far as known. machine: empty if these keys send no samples."""
+    """What is examined. machine: empty if these keys send no samples."""
 
     options: Namespace
     site: str
@@ -143,7 +143,7 @@ def _spool(subject: Subject, session: zenoh.Session | None) -> list[Finding]:
 
 
 def _spool_itself(subject: Subject, path: Path, session: zenoh.Session | None) -> list[Finding]:
-    """The file; if an agent has it open, its health report, with its positions."""
+    """The file; if open in an agent, its health report and positions."""
     try:
         return [disk.check_spool(disk.read_spool(path), time.time_ns())]
     except disk.InUseError:
@@ -167,7 +167,7 @@ def _store(folder: Path | None, journal: str, site: SiteConfig | None) -> list[F
 
 
 def check_positions(machine: str, values: Mapping[str, Any]) -> Finding:
-    """Verdicts on an agent's receivers, from its health report of any content."""
+    """An agent's receivers, by its health report of any content."""
     pipeline = values.get("pipeline")
     shown = pipeline.get("consistency") if isinstance(pipeline, Mapping) else None
     receivers = {
@@ -188,7 +188,7 @@ def check_positions(machine: str, values: Mapping[str, Any]) -> Finding:
 
 
 def _misstated(receiver: str, consistency: Mapping[str, Any]) -> str:
-    """How a receiver misstates its error; empty if about right."""
+    """A receiver's misstatement of its error; empty if about right."""
     factor = consistency.get("variance_factor")
     if not isinstance(factor, int | float) or not factor > 0 or 1 / MISSTATED < factor < MISSTATED:
         return ""

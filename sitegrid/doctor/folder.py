@@ -19,12 +19,12 @@ from sitegrid.setup.hearing import HeardLine
 from sitegrid.setup.listening import listen_to
 
 LISTEN_S = 2.5  # receivers send every second
-FAR_M = 5000.0  # beyond it from the origin: works, but few sites are that large
+FAR_M = 5000.0  # unusually far from the origin
 UNFED = "nothing feeds it: name it in `feeds` of a [[driver]], or say `use = false`"
 
 
 def examine_folder(path: Path) -> list[Finding]:
-    """Check a folder's contents; parts that need an unreadable file are skipped."""
+    """Check a folder; parts needing an unreadable file are skipped."""
     folder = Folder(path)
     try:
         site, machine, config = folder.load()
@@ -50,7 +50,7 @@ def _store(folder: Folder, site: SiteConfig) -> Finding:
 
 
 def _spool(folder: Folder) -> tuple[Finding, bool]:
-    """The spool, and whether an agent has it open."""
+    """The spool; whether an agent has it open."""
     if not folder.spool.exists():
         return skipped("spool", "`sitegrid up` makes it"), False
     try:
@@ -62,7 +62,7 @@ def _spool(folder: Folder) -> tuple[Finding, bool]:
 
 
 def _receivers(site: SiteConfig, config: AgentConfig) -> list[Finding]:
-    """Ports of drivers, and ports for corrections only."""
+    """Ports of drivers and corrections."""
     drivers = [driver for driver in config.driver if driver.kind in DECODERS]
     heard = listen_to([driver.address for driver in drivers], LISTEN_S)
     findings = [check_receiver(driver, at_port) for driver, at_port in zip(drivers, heard, strict=True)]

@@ -56,7 +56,7 @@ def read_certificate(folder: Path) -> Certificate:
 
 
 def check_certificate(certificate: Certificate, now: datetime, site: str = "", machine: str = "") -> list[Finding]:
-    """Validity, name and chain of a certificate. site, machine: its purpose, if known."""
+    """Validity, name, chain. site, machine: the certificate's purpose, if known."""
     who = f"{certificate.identity.role} {certificate.identity.name} of site {certificate.identity.site}"
     return [_validity(certificate, now, who), _name(certificate, site, machine, who), _chain(certificate)]
 

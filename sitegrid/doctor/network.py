@@ -36,7 +36,7 @@ from sitegrid.trust_sentences import rolls
 ANSWER_S = 5.0
 LINK_S = 3.0
 HEALTH_S = 3.0  # an agent reports every second
-AHEAD_S = 60.0  # newest stamp ahead of the server's clock: beyond the error of clocks set by hand
+AHEAD_S = 60.0  # newest stamp ahead of the server's clock, beyond errors of setting by hand
 OFFSET_S = 1.0  # clock offset beyond which the map's ages are wrong
 
 
@@ -45,7 +45,7 @@ OFFSET_S = 1.0  # clock offset beyond which the map's ages are wrong
 
 @dataclass(frozen=True)
 class RouterLink:
-    """Link to the router. took_s: to open a session, None: failed. listens: something accepts connections."""
+    """Link to the router. took_s: to open a session, None: failed. listens: accepts connections."""
 
     endpoint: str
     took_s: float | None
@@ -56,7 +56,7 @@ class RouterLink:
 def open_link(config: SessionConfig) -> tuple[RouterLink, zenoh.Session | None]:
     """Open a session and describe the result."""
     has_keys = config.credentials is not None
-    if not _listens(config.endpoint):  # else Zenoh retries until the timeout
+    if not _listens(config.endpoint):  # Zenoh would retry until the timeout
         return RouterLink(config.endpoint, None, has_keys=has_keys), None
     start_s = time.perf_counter()
     try:
@@ -92,9 +92,9 @@ def check_link(link: RouterLink) -> Finding:
 
 
 def ask_info(session: zenoh.Session, site: str) -> tuple[MapInfo | None, tuple[int, int]]:
-    """The server's `info`, None without an answer; and this host's clock before and after [ns].
+    """The server's `info`, None without an answer; this host's clock before and after [ns].
 
-    MessageError if the answer is unreadable.
+    MessageError on unreadable answers.
     """
     before_ns = time.time_ns()
     data = _ask(session, keys.map_query(site, "info"), b"")
@@ -121,14 +121,14 @@ def ask_machines(session: zenoh.Session, site: str) -> tuple[MachineState, ...]:
 
 
 def check_machines(machines: Iterable[MachineState]) -> Finding:
-    """Whether a machine's rolling resistance differs from the others' on the same ground."""
+    """Whether a machine's rolling resistance differs from others' on the same ground."""
     said = [f"{machine.name} {text}" for machine in machines if (text := rolls(machine))]
     message = "; ".join(said) or "none is known to roll unlike the others on the same ground"
     return Finding(Level.WARN if said else Level.PASS, "machines", message)
 
 
 def check_writers(servers: list[MapInfo]) -> Finding:
-    """Whether exactly one map server takes the site's samples."""
+    """Whether the site has exactly one writing map server."""
     names = [f"pid {info.server.pid} on host {info.server.host}, store {info.store}" for info in servers]
     if len(servers) == 1:
         return Finding(Level.PASS, "writer", names[0])
@@ -154,7 +154,7 @@ def check_followers(followers: list[FollowerState], info: MapInfo) -> Finding:
 
 
 def offset_of(info: MapInfo, asked_ns: tuple[int, int]) -> tuple[float, float]:
-    """How far the host's clock is ahead of the server's, and the error bound [s]."""
+    """Lead of the host's clock over the server's, error bound [s]."""
     before_ns, after_ns = asked_ns
     return ((before_ns + after_ns) / 2 - info.wall_ns) * 1e-9, (after_ns - before_ns) / 2 * 1e-9
 
@@ -175,7 +175,7 @@ def check_server(site: str, info: MapInfo | None, *, is_there: bool, role: str =
 
 
 def check_losses(info: MapInfo) -> Finding:
-    """Recorded or acknowledged samples missing in the store, by machine."""
+    """Recorded or acknowledged samples missing in the store."""
     parts = {
         "declared lost": {name: counts.lost for name, counts in info.machines.items() if counts.lost},
         "acknowledged and gone": {name: counts.missing for name, counts in info.machines.items() if counts.missing},
@@ -199,7 +199,7 @@ def check_site(site: SiteConfig, info: MapInfo) -> Finding:
 
 
 def check_clock(offset_s: float, error_s: float, site: SiteConfig | None) -> Finding:
-    """Judge how far the host's clock is ahead of the server's. error_s: error bound."""
+    """Judge the host clock's lead. error_s: error bound."""
     ahead = "ahead of" if offset_s > 0 else "behind"
     message = f"{abs(offset_s):.2f} s {ahead} the map server's clock (+-{error_s:.2f} s)"
     advice = "set both clocks by NTP (chrony, systemd-timesyncd)"
@@ -213,7 +213,7 @@ def check_clock(offset_s: float, error_s: float, site: SiteConfig | None) -> Fin
 
 def check_time(info: MapInfo) -> Finding:
     """Whether machines' stamps fit the server's clock."""
-    advice: dict[str, str] = {}  # by problem; counts stay until a restart and must not hide others
+    advice: dict[str, str] = {}  # by problem; counts last until a restart and must not hide others
     if (ahead_s := (info.stamp_ns - info.wall_ns) * 1e-9) > AHEAD_S:
         trusted = {name: counts for name, counts in info.machines.items() if name not in info.distrusted}
         newest = max(trusted, key=lambda name: trusted[name].newest_ns, default="?")
@@ -231,7 +231,7 @@ def check_time(info: MapInfo) -> Finding:
 
 
 def check_version(own: str, other: str) -> Finding:
-    """Whether both sides have one version; others may work too, since the wire is versioned separately."""
+    """Whether both sides have one version; others may work, since the wire has its own version."""
     if UNKNOWN in (own, other):
         return skipped("version", f"here {own}, map server {other}: one of them runs without being installed")
     if own == other:
@@ -245,9 +245,9 @@ def check_version(own: str, other: str) -> Finding:
 def ask_permission(
     session: zenoh.Session, site: str, machine: str, frame: str, folder: Path | None
 ) -> Ack | Refused | None:
-    """Send an empty batch of a random spool; the answer is its watermark and leaves no trace (docs/protocol.md).
+    """Send an empty batch of a random spool; its watermark leaves no trace (docs/protocol.md).
 
-    folder: of the machine's keys; signed if they have a signature key.
+    folder: of the machine's keys; signed if they include a signature key.
     """
     key = keys.ingest(site, machine)
     batch = encode_batch(SampleBatch(machine, secrets.randbits(64) or 1, 1, empty(), frame))
@@ -259,7 +259,7 @@ def ask_permission(
 
 
 def check_permission(machine: str, answer: Ack | Refused | None, *, is_there: bool, has_keys: bool) -> Finding:
-    """Whether a machine's batches are accepted, by the answer to an empty one."""
+    """Whether a machine's batches are accepted, judged by the answer to an empty one."""
     if isinstance(answer, Ack):
         return Finding(Level.PASS, "permission", f"batches of {machine} are taken")
     if isinstance(answer, Refused):
@@ -289,7 +289,7 @@ def receive_health(session: zenoh.Session, site: str, machine: str) -> Health | 
 
 
 def _ask(session: zenoh.Session, key: str, payload: bytes, attachment: bytes | None = None) -> bytes | None:
-    """The answer, or None. A just connected server may not be visible yet, so queries are retried briefly."""
+    """The answer, or None. A new server may not be visible yet, hence brief retries."""
     end_s = time.monotonic() + KNOWN_S
     while True:
         for reply in session.get(key, payload=payload, attachment=attachment, timeout=ANSWER_S):

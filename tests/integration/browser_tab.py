@@ -20,7 +20,7 @@ NOBODY = "http://nobody.invalid/**"
 
 
 def launched() -> Iterator[Any]:
-    """A browser for the length of the test."""
+    """A browser for one test."""
     from playwright.sync_api import Error, sync_playwright
 
     with sync_playwright() as playwright:
@@ -57,7 +57,7 @@ class Tab:
         return self.page.evaluate(expression)
 
     def until(self, expression: str) -> None:
-        """Wait for an expression; the page's rules forbid the browser's own way."""
+        """Wait for an expression; the page's rules forbid the browser's own wait."""
         for _ in range(int(WAIT_MS / 50)):
             if self.js(expression):
                 return
@@ -65,7 +65,7 @@ class Tab:
         raise AssertionError(f"did not come true: {expression}; {self.complaints}")
 
     def drawn(self) -> None:
-        """Wait for two animation frames: earlier requests are done."""
+        """Wait for two animation frames, after earlier requests."""
         self.js("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     def loaded(self) -> Tab:
@@ -89,7 +89,7 @@ class Tab:
 
 
 def watched(browser: Any, url: str) -> Iterator[Tab]:
-    """A tab for one test, without complaints or foreign requests at its end."""
+    """A tab for one test, finally free of complaints and foreign requests."""
     tab = Tab(browser, url).loaded()
     yield tab
     assert tab.complaints == []

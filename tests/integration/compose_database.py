@@ -1,4 +1,4 @@
-"""PostgreSQL's image with local programs: create data, run scripts, serve."""
+"""PostgreSQL's image by local programs: create data, run scripts, serve."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class DatabaseServer:
         self.do("pg_ctl", "stop", "-w", "-m", "fast", "-D", data)
 
     def enter(self, words: Sequence[str]) -> None:
-        """Start through the compose file's own entry point."""
+        """Start by the compose file's entry point."""
         program, script, *rest = words
         self.run([program, str(self._copied(self._files[script])), *rest])
 

@@ -1,7 +1,7 @@
 """compose.yaml without an engine: its commands as local processes, in order, with health checks.
 
-Host names become free loopback ports, volumes folders, the working directory the project. PostgreSQL's image is
-replaced by local programs and the work of its entry point.
+Host names become free loopback ports, volumes folders, the working directory the project; local programs replace
+PostgreSQL's image and its entry point.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ def image_environment(dockerfile: Path) -> dict[str, str]:
 
 @dataclass
 class ComposeRun:
-    """The services of one file, started in its order.
+    """One file's services, started in its order.
 
-    ports: on this host, by those inside. health: check results per service, newest last. databases: folder accessible
-    to another user, if needed.
+    ports: on this host, by those inside. health: results by service, newest last. databases: folder accessible to
+    another user, if needed.
     """
 
     services: Mapping[str, Any]
@@ -71,7 +71,7 @@ class ComposeRun:
         self.ports |= {port: free_port() for port in listened_on(self.services)}
 
     def up(self) -> None:
-        """Start each service once its dependencies are ready."""
+        """Start each service after its dependencies."""
         for name in self.services:
             self._start(name)
 
@@ -137,7 +137,7 @@ class ComposeRun:
         return made
 
     def _wait_healthy(self, name: str) -> None:
-        """Fails like an engine: after the retries that follow the start period."""
+        """Fails like an engine: after the start period's retries."""
         health = self.services[name]["healthcheck"]
         patience_s = _seconds(health["start_period"]) + health["retries"] * _seconds(health["interval"])
         end_s = time.monotonic() + patience_s
@@ -162,14 +162,12 @@ class ComposeRun:
 
 
 def listened_on(services: Mapping[str, Any]) -> set[str]:
-    """Ports that services listen on."""
     words = [word for service in services.values() for word in service["command"]]
     published = [port.rsplit(":", 1)[1] for service in services.values() for port in service.get("ports", [])]
     return {match[1] for word in words if (match := re.fullmatch(r"(?:tcp/)?0\.0\.0\.0:(\d+)", word))} | set(published)
 
 
 def _volumes(service: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Sources and targets of volumes and files."""
     return [(volume.split(":")[0], volume.split(":")[1]) for volume in service.get("volumes", [])]
 
 

@@ -24,7 +24,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    """A site on the web after a minute of driving; tests read it, or drive on."""
+    """A site on the web after a minute of driving; tests read or drive on."""
     folder = tmp_path_factory.mktemp("web")
     with Forks(folder) as started:
         site = WebSite(folder, started, "--host", "map.example")
@@ -34,7 +34,7 @@ def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
 
 @pytest.fixture(scope="session")
 def hauling(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    """A site on the web after four days of haulers; read-only."""
+    """A read-only site on the web after four days of haulers."""
     folder = tmp_path_factory.mktemp("hauling")
     with Forks(folder) as started:
         yield hauling_site(folder, started)
@@ -48,7 +48,7 @@ def children(tmp_path: Path) -> Iterator[Forks]:
 
 @pytest.fixture
 def site(tmp_path: Path, children: Forks) -> SiteRun:
-    """A site without drivers; nothing runs yet."""
+    """A site without drivers, not started."""
     return SiteRun(tmp_path, children, free_endpoint(), NOBODY_DRIVES)
 
 

@@ -1,7 +1,6 @@
-"""Processes of a site forked from a server with loaded libraries.
+"""Site processes forked from a server with loaded libraries.
 
-A start takes a tenth of the CPU time; kills, signals, exit codes and files are real. Tests of loading start commands
-themselves.
+A tenth of the CPU time per start; kills, signals, exit codes and files are real. Tests of loading start real commands.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ class Fork:
 
 
 def run(words: list[str], output: Connection, log: Path, folder: Path, environment: dict[str, str]) -> None:
-    """In the new process: run the command as if started from a shell."""
+    """In the fork: run the command as from a shell."""
     os.setsid()
     for source, number in ((os.open(os.devnull, os.O_RDONLY), 0), (output.fileno(), 1)):
         os.dup2(source, number)

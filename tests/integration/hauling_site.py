@@ -1,4 +1,4 @@
-"""Haulers on roads of known ground for days, and a site on the web with their map."""
+"""Days of haulers on known roads, and a site on the web with their map."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PASSES = 5
 
 
 class Hauler:
-    """A machine with one batch of passes over roads per day."""
+    """A machine with a daily batch of passes over roads."""
 
     def __init__(self, name: str, days: list[Table]) -> None:
         self.name, self._days, self._seq = name, days, 0
@@ -39,10 +39,7 @@ class Hauler:
 
 
 def haulers() -> list[Hauler]:
-    """Three machines, each on its own road.
-
-    One road worsens by 0.005 a day; one is repaired on the last day; on one no mass is stated.
-    """
+    """Three machines on separate roads: one worsens by 0.005 a day, one is repaired on the last, one has no mass."""
     at = [day * DAY_S for day in range(DAYS)]
     worse = [passes(WORSE, PASSES, 0.04 + 0.005 * day, day, at[day]) for day in range(DAYS)]
     repaired = [passes(REPAIRED, PASSES, 0.05 if day < DAYS - 1 else 0.03, day, at[day]) for day in range(DAYS)]
@@ -56,9 +53,8 @@ def haulers() -> list[Hauler]:
 
 
 def hauling_site(folder: Path, children: Children) -> WebSite:
-    """The site after the drives."""
     site = WebSite(folder, children)
     site.machines = haulers()  # type: ignore[assignment]
     site.drive(DAYS * BATCH_S)
-    site.client.ask(WorklistQuery(after=site.client.info().merged))  # from here on roads include all drives
+    site.client.ask(WorklistQuery(after=site.client.info().merged))  # roads now include all drives
     return site

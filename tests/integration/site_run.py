@@ -91,6 +91,5 @@ class SiteRun:
 
 
 def kill(child: Child) -> None:
-    """Kill a process without cleanup."""
     child.send(signal.SIGKILL)
     child.wait(PATIENCE_S)

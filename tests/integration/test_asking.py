@@ -25,7 +25,7 @@ pytestmark = pytest.mark.processes
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SiteRun]:
-    """Router and server, left unchanged by each test."""
+    """Router and server, unchanged by tests."""
     folder, sim = tmp_path_factory.mktemp("asked"), NOBODY_DRIVES
     with Forks(folder) as children:
         run = SiteRun(folder, children, free_endpoint(), sim)

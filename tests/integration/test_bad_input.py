@@ -28,11 +28,11 @@ pytestmark = pytest.mark.processes
 
 NOW_NS = 1_767_225_600_000_000_000
 MACHINE = "probe"
-UNCHANGED = ("journalled", "merged", "samples_merged", "cells", "stamp_ns", "machines")  # unchanged by refusals
+UNCHANGED = ("journalled", "merged", "samples_merged", "cells", "stamp_ns", "machines")  # by refusals
 
 
 class Probe:
-    """A site with router and server, and a session for arbitrary input."""
+    """Router and server, with a session for arbitrary input."""
 
     def __init__(self, run: SiteRun) -> None:
         self.router, self.server, self.run = run.start_router(), run.start_server(), run
@@ -80,7 +80,7 @@ def probe(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Probe]:
 
 
 def edited(probe: Probe, **fields: Any) -> bytes:
-    """A valid batch with changed fields, None: removed."""
+    """A valid batch with changed fields; None removes one."""
     table = {**msgpack.unpackb(encode_batch(probe.batch())), **fields}
     return bytes(msgpack.packb({name: value for name, value in table.items() if value is not None}))
 
@@ -164,7 +164,7 @@ def test_a_bad_query_is_refused_counted_and_named(probe: Probe, selector: str):
 
 @pytest.mark.nightly
 def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children: Forks, tmp_path):
-    """The server's site is smaller than the agent's: samples beyond it are refused, later ones arrive."""
+    """Samples beyond the server's smaller site are refused, later ones arrive."""
     sim = SimConfig(machines=1, seconds=60, speed=10, seed=3, world="fast")
     run = SiteRun(tmp_path, children, free_endpoint(), sim)
     wide = run.site_file.read_text()
@@ -202,7 +202,7 @@ def words(sim: SimConfig) -> list[str]:
 
 
 def middle_of(log: Any, run: SiteRun) -> float:
-    """Extent that contains about half of a recorded drive [m]."""
+    """Extent of about half a recorded drive [m]."""
     from protocol.machine.log_folder import open_log
     from protocol.machine.readings import Gps
     from protocol.site.site_config import Projection

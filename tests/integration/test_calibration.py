@@ -61,7 +61,7 @@ def stored(folder: Path, site: SiteRun) -> closing[Store]:
 
 
 def folded(site: SiteRun, corrections: SampleCorrections, sent: dict[str, Table]) -> Grid:
-    """Fold of all sent samples, corrected in numpy."""
+    """Fold of all samples, corrected in numpy."""
     grid = Grid(load_site(site.site_file).cell_m, ServerConfig().fold)
     for name, rows in sent.items():
         out = rows.copy()
@@ -111,7 +111,7 @@ def test_asked_for_the_map_is_that_of_a_first_fold_everywhere(site: SiteRun):
 
 
 def killed_with_a_fact_on_disk(site: SiteRun, server: Child) -> None:
-    """Kill a server right after storing a decision, before or after its fold."""
+    """Kill a server right after storing a decision, around its fold."""
     with site.connect() as client:
         try:
             client.correct("a", "levelled", zero=ZERO, wait_s=0.0)
@@ -155,7 +155,7 @@ def test_after_an_accident_the_next_start_has_the_fact_in_its_map(
 
 @pytest.mark.nightly
 def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path: Path, children: Children):
-    """Offered with the first acknowledgement of samples; applied at a standstill or at a tour's end."""
+    """Offered with the samples' first acknowledgement; applied at standstill or a tour's end."""
     sim = SimConfig(machines=2, seconds=160, speed=10, seed=3, world="fast")
     site = SiteRun(tmp_path, children, free_endpoint(), sim)
     one, other = (config.stem for config in site.configs)

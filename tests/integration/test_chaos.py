@@ -65,7 +65,7 @@ def test_samples_that_wait_for_the_smoother_outlive_kills_and_silence(tmp_path, 
 
 
 def harmless(tmp_path: Path, fault: Callable[[FaultRun], FaultOutcome]) -> FaultOutcome:
-    """Outcome of a fault on a site of two machines, without losses."""
+    """Outcome of a lossless fault on a site of two machines."""
     recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=80)
     outcome = fault(scenario(tmp_path / "run", recordings=recordings))
     assert (outcome.lost, outcome.double, outcome.silent, outcome.problems) == (0, 0, 0, [])

@@ -1,4 +1,4 @@
-"""compose.yaml works: its commands run as local processes, and machines draw a map."""
+"""compose.yaml's commands as local processes: machines draw a map."""
 
 from __future__ import annotations
 

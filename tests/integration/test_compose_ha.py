@@ -27,7 +27,7 @@ ROWS = "SELECT row, record FROM sitegrid.journal ORDER BY row"
 
 
 class HighlyAvailable:
-    """The services of `docker compose --profile ha up follower`, and two sending machines."""
+    """Services of `docker compose --profile ha up follower` and two sending machines."""
 
     def __init__(self, run: compose_run.ComposeRun, root: Path, children: Children) -> None:
         self.run, self.children, self.folder = run, children, run.folder
@@ -57,7 +57,7 @@ class HighlyAvailable:
         return [name for name in SERVERS if state in self.said[self.server(name).pid]]
 
     def wait_for_acknowledgements(self, beyond: int = 0, count: int = 20) -> float:
-        """Wait for each machine's next acknowledgements with an epoch above `beyond`; returns the first one's time."""
+        """Wait for each machine's next acknowledgements with an epoch above `beyond`; returns the first's time."""
         before = {one.machine: len(one.acknowledged) for one in self.senders}
 
         def new(one: Sender) -> list[float]:
@@ -90,7 +90,7 @@ def test_profile_ha_survives_its_writer_and_its_primary_and_its_follower_answers
     pids = {name: child.pid for name, child in run.started.items()}
     assert len(set(pids.values())) == len(services), f"a process each: {pids}"
 
-    # Two servers start at once on a new database: one serves, the other waits.
+    # Two servers start at once on a new database: one serves, one waits.
     until(lambda: len(site.which("ready")) == 1 and len(site.which("standby")) >= 1, "one serves, one waits")
     follower = run.started["follower"]
     assert isinstance(follower, Child)

@@ -1,4 +1,4 @@
-"""Corrections through real processes: from a caster to a receiver's port, and their health."""
+"""Corrections through real processes: caster to receiver's port, and health."""
 
 from __future__ import annotations
 

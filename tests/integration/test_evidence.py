@@ -31,7 +31,7 @@ CONFIG = "[store]\narchive_after_h = 0\n[trust]\njudge_s = 0.2\n[calibration]\na
 
 
 def sweep(seed: int, hour: float, gain: float = 1.0, *, repaved: bool = False) -> Table:
-    """Every metre of a square of three zones; the eastern one is wet dirt until repaved."""
+    """Every metre of three zones; the eastern one is wet dirt until repaved."""
     draw = np.random.default_rng(seed)
     x, y = (v.ravel() + 0.5 for v in np.meshgrid(np.arange(SIZE), np.arange(SIZE)))
     zone = np.array([0.008, 0.04, NEW if repaved else OLD])[(x * 3 // SIZE).astype(int)]
@@ -44,7 +44,7 @@ def sweep(seed: int, hour: float, gain: float = 1.0, *, repaved: bool = False) -
 
 
 class Senders:
-    """Machines that send batches in turn, with separate spools."""
+    """Machines sending batches in turn, a spool each."""
 
     def __init__(self, site_run: SiteRun, client: Client) -> None:
         self._client, self._site = client, load_site(site_run.site_file)
@@ -74,7 +74,7 @@ def server(site_run: SiteRun, tmp_path: Path) -> Iterator[Child]:
 
 
 def resistance(client: Client, **when: Any) -> float:
-    """Median of the eastern zone away from its border."""
+    """Median inside the eastern zone."""
     bounds = Bounds(SIZE * 2 / 3 + 4, 4.0, SIZE - 4.0, SIZE - 4.0)
     region = client.ask(RegionQuery(bounds, ("resistance",), **when))
     return float(np.nanmedian(region["resistance"]))

@@ -1,4 +1,4 @@
-"""`sitegrid fold` by processes and a Dask cluster: the same store, even if they are killed midway."""
+"""`sitegrid fold` by processes and a Dask cluster: the same store, even if killed midway."""
 
 from __future__ import annotations
 
@@ -55,14 +55,13 @@ def write(folder: Path, site: SiteConfig, numbers: range) -> None:
 
 @pytest.fixture(scope="module")
 def expected(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Result of one process."""
     out = tmp_path_factory.mktemp("expected") / "store"
     assert main(["fold", str(archive), "--out", str(out), "--json"]) == 0
     return contents(out)
 
 
 def contents(store: Path) -> dict[str, str]:
-    """Contents without the store's random id, and the names of the other files."""
+    """Contents but the store's random id; names of other files."""
     files = {path for path in store.rglob("*") if path.is_file() and path.name not in ("lock", "journal.db-mark")}
     hashes = {".toml": Path.read_text, ".checkpoint": evidence_hash}
     return {str(path.relative_to(store)): hashes.get(path.suffix, lambda _: "")(path) for path in files}
@@ -73,7 +72,7 @@ def started(*words: object) -> subprocess.Popen[bytes]:
 
 
 def children_of(pid: int) -> set[int]:
-    """Children started by any thread of a process, Python's resource tracker included."""
+    """Children of all threads of a process, with Python's resource tracker."""
     return {int(word) for path in Path(f"/proc/{pid}/task").glob("*/children") for word in path.read_text().split()}
 
 
@@ -130,7 +129,7 @@ class Deaths(distributed.diagnostics.plugin.SchedulerPlugin):
 
 @pytest.fixture
 def dask(monkeypatch: pytest.MonkeyPatch) -> Iterator[distributed.LocalCluster]:
-    """A scheduler and two workers, processes with nannies."""
+    """A scheduler and two workers with nannies."""
     monkeypatch.setattr(Cluster, "task_samples", 1)
     options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": 50}
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **options) as cluster:
@@ -161,7 +160,7 @@ def test_a_cluster_whose_workers_die_makes_the_same_store(
     dask.scheduler.add_plugin(deaths)
     dask.adapt(minimum=2, maximum=2, interval="1 s")  # a nanny may end with its worker
     with distributed.Client(dask) as client:
-        client.register_plugin(KillWorker(4.0, mode))  # a shorter time kills starting workers, which ends their nannies
+        client.register_plugin(KillWorker(4.0, mode))  # any sooner kills starting workers, and so their nannies
     for number in range(MOST_FOLDS):
         out, before = tmp_path / str(number), deaths.count
         assert main(["fold", str(archive), "--out", str(out), "--engine", address(dask), "--json"]) == 0
@@ -191,7 +190,7 @@ def test_a_cluster_that_loses_all_its_workers_is_named(
 def test_a_scheduler_that_dies_is_named_and_the_fold_goes_on_without_it(
     archive: Path, expected: dict[str, str], tmp_path: Path
 ) -> None:
-    """Scheduler and workers as separate processes; the scheduler is killed."""
+    """Separate processes; the scheduler is killed."""
     out, port_file = tmp_path / "out", tmp_path / "scheduler.json"
     command = [sys.executable, "-c", "from distributed.cli.dask_scheduler import main; main()"]
     command += ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0", "--no-dashboard"]

@@ -40,7 +40,7 @@ QUIET = "[store]\narchive_after_h = 0.0\n[trust]\nexclude = false\n[calibration]
 
 
 class Followed(SiteRun):
-    """Router and server with followers, and a session that sends samples."""
+    """Router and server with followers, and a sending session."""
 
     def start_follower(self, name: str, *, ready: bool = True) -> Child:
         words = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--name", name)
@@ -56,21 +56,21 @@ class Followed(SiteRun):
 
 
 class Sender:
-    """Sends random batches, one spool each."""
+    """Sends random batches, a spool each."""
 
     def __init__(self, run: Followed) -> None:
         self.session = open_session(SessionConfig(run.endpoint))
         self._site, self._spool = load_site(run.site_file), 0
 
     def send(self, machine: str = "a", n: int = 50) -> int:
-        """Returns the batch's acknowledged row."""
+        """Returns the batch's journal row."""
         self._spool += 1
         rows = random_samples(n, self._spool)
         batch = encode_batch(SampleBatch(machine, self._spool, 1, rows, self._site.frame))
         replies: list[zenoh.Reply] = []
         key = keys.ingest(self._site.name, machine)
 
-        def is_answered() -> bool:  # a router just joined may know nobody yet
+        def is_answered() -> bool:  # a new router may know nobody yet
             replies[:] = self.session.get(key, payload=batch, timeout=60.0)
             return bool(replies)
 
@@ -149,7 +149,7 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
                 "segments",
                 "worklist",
                 *lines,
-            ):  # a server that followed, and processes that read everything
+            ):  # a former follower, and full readers
                 answers = [roads(sender, run, name, query, row) for name in ("", "near", "far")]
                 assert answers[0] == answers[1] == answers[2], (query, pids)
             drawn = [tiles(sender, run, name) for name in ("", "near", "far")]
@@ -174,7 +174,7 @@ def decode_point_row(sender: Sender, key: str, stamp_ns: int) -> int:
 
 
 def answered(client: Client, sender: Sender, run: Followed, *followers: str) -> list[int]:
-    """Queries answered by the server, then by followers."""
+    """Numbers of queries answered by server and followers."""
     infos = [client.info()]
     for name in followers:
         data = sender.ask(keys.follower_query(run.site, name, "info"), "").payload.to_bytes()
@@ -202,7 +202,7 @@ def test_each_query_is_worked_by_one_process_and_by_another_while_one_dies(run: 
         assert sum(done) - 3 == asked, pids  # plus the three counting queries
         assert done[0] == 1, pids  # the server only counted
         assert set(origins.values()) <= {"near", "far"}
-        # One is stopped during a query and killed: the other one answers.
+        # Stop one during a query and kill it: the other answers.
         victim = next((client for client in clients if origins[client] == "near"), clients[0])
         name = origins[victim]
         child, other = (near, "far") if name == "near" else (far, "near")
@@ -243,17 +243,17 @@ def test_the_map_is_read_while_the_server_is_away_and_after_it_is_back(run: Foll
         again = run.serve()
         later = sender.send()
         assert later > row, f"server pid {again.pid}, follower pid {follower.pid}"
-        # A row that it lacks for its second is queried from the server: `after` keeps its meaning.
+        # Rows it lacks are queried from the server: `after` keeps its meaning.
         assert client.ask(PointQuery(1.0, 1.0, after=later)).version.row >= later
         until(lambda: client.ask(PointQuery(1.0, 1.0, after=later)) and client.origin.follower == "near", "followed")
 
 
-# --- one server and one follower, which tests only ask
+# --- one server and one follower, unchanged by tests
 
 
 @dataclass(frozen=True)
 class Quiet:
-    """A site with one row, and a follower that has it."""
+    """A site with one row, and a follower at it."""
 
     run: Followed
     sender: Sender

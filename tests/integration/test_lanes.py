@@ -1,4 +1,4 @@
-"""The map fed back through real processes: machines draw it, use its lanes, and continue without a server."""
+"""The map fed back in real processes: machines draw it, use its lanes, continue without a server."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_machines_follow_the_lanes_that_they_drew_also_while_the_server_is_down(
                     used[health.machine] = health.stamp_ns
 
             def follow_for(seconds: float) -> None:
-                """Wait until all machines used lanes that much longer, in their own time."""
+                """Wait until all machines used lanes that much longer in their own time."""
                 before = dict(used)
                 until(
                     lambda: len(used) == 4 and all(used[m] > before.get(m, 0) + seconds * 1e9 for m in used),

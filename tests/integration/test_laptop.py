@@ -1,4 +1,4 @@
-"""A new user's laptop in real processes: a receiver on a port, `init`, `doctor`, `up`, Ctrl-C."""
+"""A new user's laptop: receiver on a port, `init`, `doctor`, `up`, Ctrl-C; real processes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EAST_PER_M = 1 / 73_000  # degrees of longitude at 49 degrees north
 
 
 def driving(begun_s: float) -> bytes:
-    """A receiver's current bytes on an eastbound machine."""
+    """Current bytes of a receiver moving east."""
     passed_s = round(time.monotonic() - begun_s, 3)
     at = BEGIN + timedelta(seconds=passed_s)
     date = {
@@ -43,7 +43,7 @@ def driving(begun_s: float) -> bytes:
 
 
 def children_of(parent: Child) -> dict[str, int]:
-    """Processes started by `up`, by command."""
+    """Processes of `up`, by command."""
     listed = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text("ascii").split()
     commands = {pid: Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0") for pid in map(int, listed)}
     return {words[3].decode(): pid for pid, words in commands.items() if b"sitegrid.cli" in words}

@@ -1,4 +1,4 @@
-"""A foreign machine's log through real processes: fixes in metres, two wheels, Doppler, a headerless file."""
+"""A foreign machine's log in real processes: fixes in metres, two wheels, Doppler, a headerless file."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
-# Ctrl-C before the n-th import. Every command line would soon end by itself.
+# Ctrl-C before the n-th import; every command would end by itself soon.
 IMPORTS = (1, 100, 350)
 LINES = {command.words[0]: command.line({"endpoint": "none"}) for command in reversed(COMMANDS)} | {
     "agent": ["agent", "--spool", "x.db"],
@@ -30,7 +30,7 @@ LINES = {command.words[0]: command.line({"endpoint": "none"}) for command in rev
     "log": ["log", "run", "missing"],
     "router": ["router", "--listen", "none"],
 }
-# One process without imports, whose forks start like the command.
+# A process without imports, whose forks start like the command.
 FORKS = """
 import os, signal, sys
 import sitegrid.cli
@@ -145,7 +145,7 @@ def children_of(pid: int) -> list[int]:
 
 @pytest.mark.nightly
 def test_a_recording_outlives_its_terminal(tmp_path: Path):
-    """SIGHUP, and a terminal that takes no more output."""
+    """SIGHUP, and a blocked terminal."""
     ours, theirs = os.openpty()
     words = sitegrid("sim", "--record", "logs", "--machines", 1, "--world", "fast", "--seconds", 3000)
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), theirs)

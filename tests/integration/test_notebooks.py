@@ -1,4 +1,4 @@
-"""Notebooks of examples/, Python and commands of the documents run on a site; the documents build."""
+"""Notebooks of examples/, and the documents' Python and commands, on a site; the documents build."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def test_the_python_of_a_page_runs_and_prints_what_stands_below_it(hauling: WebS
 
 
 def outline(printed: str) -> list[str]:
-    """Lines without their numbers and names of road sections."""
+    """Lines without numbers and road names."""
     return [re.sub(r"[-\d._]+[ens]?\b|nan", "#", line) for line in printed.splitlines()]
 
 
 @pytest.mark.processes
 def test_what_the_readme_asks_of_a_running_site_is_answered(hauling: WebSite, tmp_path: Path):
-    """Its commands in one process each, but for those that start or simulate something."""
+    """Each command in a process, except those that start or simulate something."""
     blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
     lines = [shlex.split(line, comments=True) for line in "".join(blocks).splitlines()]
     asked = [

@@ -35,12 +35,12 @@ from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
-END_S = 25.0  # ten times its own limit; Zenoh's replies and links, which it must not await, take 30
+END_S = 25.0  # ten times its own limit; Zenoh's replies and links, not to be awaited, take 30
 NOW_NS = 1_767_225_600_000_000_000
 
 
 def end(child: Child) -> None:
-    """SIGTERM must end it cleanly, whatever it waits for."""
+    """SIGTERM ends it cleanly, whatever it waits for."""
     child.send(signal.SIGTERM)
     assert child.wait(END_S) == 0
 
@@ -50,7 +50,7 @@ def session_of(endpoint: str) -> closing[zenoh.Session]:
 
 
 def drive(n: int, seed: int, first_s: int = 0) -> np.ndarray:
-    """Samples of a machine all over 50 x 50 m, one per second."""
+    """Samples on 50 x 50 m, one per second."""
     draw = np.random.default_rng(seed)
     rows = empty(n)
     rows["stamp_ns"] = NOW_NS + (first_s + np.arange(n)) * 10**9
@@ -61,7 +61,7 @@ def drive(n: int, seed: int, first_s: int = 0) -> np.ndarray:
 
 
 class Sender:
-    """Sends batches on a thread as fast as acknowledged; keeps the last acknowledged sample."""
+    """Sends batches on a thread as fast as acknowledged; keeps the last acknowledged number."""
 
     def __init__(self, session: zenoh.Session, site: SiteConfig, machine: str, n: int = 200) -> None:
         self.machine, self.watermark = machine, 0
@@ -92,7 +92,7 @@ def committed(store: Path) -> dict[str, int]:
 
 
 def old_rows(store: Path, site: SiteConfig) -> None:
-    """Fill a store with rows to be archived at once."""
+    """Fill a store with rows due for the archive."""
     with closing(Store(JournalLocation(store), site, ServerConfig(), lambda: NOW_NS)) as opened:
         for i in range(50):
             batch = SampleBatch("old", 7, 1 + 1000 * i, drive(1000, seed=i, first_s=100 * i), site.frame)
@@ -140,7 +140,7 @@ def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: Site
 
 
 def wait_for_handlers(child: Child) -> None:
-    """Wait until it handles SIGTERM, which ends it at once before."""
+    """Wait until it handles SIGTERM, which kills it before."""
 
     def catches() -> bool:
         status = dict(line.split(":", 1) for line in Path(f"/proc/{child.pid}/status").read_text().splitlines())
@@ -199,7 +199,7 @@ def test_an_agent_in_the_middle_of_an_exchange_with_a_dead_server_ends_in_time(s
 
 @contextlib.contextmanager
 def paused(child: Child) -> Iterator[None]:
-    """Simulate a hang: sockets stay open, nothing is read."""
+    """A hang: sockets stay open, unread."""
     child.send(signal.SIGSTOP)
     try:
         yield
@@ -231,7 +231,7 @@ def test_a_query_that_follows_ends_in_time_also_while_the_server_hangs(site: Sit
 
 
 def scrape(url: str) -> dict[str, float]:
-    """Metrics by name; the only machine's for machine metrics."""
+    """Metrics by name; those of machines for the only one."""
     with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:
         families = text_string_to_metric_families(answer.read().decode())
     return {sample.name: sample.value for family in families for sample in family.samples}
@@ -283,7 +283,7 @@ def run_doctor(*words: object) -> tuple[int, dict[str, dict[str, str]]]:
 
 @pytest.fixture
 def guarded(tmp_path: Path, children: Children) -> Callable[..., tuple[int, dict[str, dict[str, str]]]]:
-    """A site with keys; runs the doctor with one name's keys."""
+    """Runs the doctor on a site with keys, with one name's."""
     pytest.importorskip("cryptography")
     folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
     assert said("keys", "init", "--dir", folder).code == 0

@@ -32,7 +32,7 @@ def tab(browser, web: WebSite) -> Iterator[Tab]:
 
 
 def known_place(web: WebSite) -> tuple[float, float]:
-    """Centre of a well known cell."""
+    """Centre of a well measured cell."""
     region = web.client.region((0, 0, 300, 300), ["resistance", "visits", "confidence"])
     sure = np.nan_to_num(region["visits"]) * np.nan_to_num(region["confidence"])
     row, column = np.unravel_index(int(sure.argmax()), sure.shape)
@@ -340,7 +340,7 @@ def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
 
 
 class Sweeper:
-    """A machine that sweeps an area once an hour; half of it is paved in between.
+    """A machine sweeping an area hourly, half of it paved in between.
 
     blind_hours: without resistance until then.
     """
@@ -351,7 +351,7 @@ class Sweeper:
         self._seq, self._blind_hours = 0, blind_hours
 
     def drive(self, from_s: float, frame: str) -> bytes:
-        """The batch of an hour, which starts 900 times later than the others' seconds."""
+        """The batch of an hour, 900 times slower than the others' seconds."""
         hour = from_s / BATCH_S
         x, y = np.meshgrid(np.arange(20.5, 80), np.arange(20.5, 50))
         rows = empty(x.size)

@@ -30,7 +30,7 @@ def tab(browser, web: WebSite) -> Iterator[Tab]:
 
 
 def opened(tab: Tab, key: str = "w") -> Any:
-    """A key's panel once it has its answer."""
+    """A key's panel after its answer."""
     tab.page.keyboard.press(key)
     tab.until(f"sitegrid.panel.name !== null && {QUIET}")
     return tab.page.locator("#panel")

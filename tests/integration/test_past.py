@@ -1,4 +1,4 @@
-"""Checkpoints of real servers: killed during writing, queried right after a distrust."""
+"""Checkpoints of real servers: killed while writing, queried after a distrust."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Sent = list[tuple[str, Table]]
 
 
 def filled_journal(folder: Path) -> Sent:
-    """A journal of two hours of ten machines; 15 minutes of each arrived last."""
+    """Two hours of ten machines, the last 15 minutes of each received last."""
     sent = list(islice(batches(), samples_of(HOURS) // BATCH))
     late = [i for i, (_, rows) in enumerate(sent) if 0.5 < (rows["stamp_ns"][0] - START_NS) / HOUR_NS % 1 < 0.75]
     sent = [each for i, each in enumerate(sent) if i not in set(late)] + [sent[i] for i in late]
@@ -57,7 +57,7 @@ def filled_journal(folder: Path) -> Sent:
 
 
 def is_fold_from_the_start(client: Client, sent: Sent, stamp_ns: int, without: str = "") -> bool:
-    """Whether a server's past map equals a fold of these samples."""
+    """Whether a past map equals the fold of these samples."""
     grid = Grid(SITE.cell_m, CONFIG.fold)
     for name, rows in sent:
         if name != without:

@@ -1,6 +1,6 @@
-"""Independent clients (`tests/clients/`) against real killed processes: 0 lost, 0 double.
+"""Independent clients (`tests/clients/`) against real, killed processes: 0 lost, 0 double, by plain SQL on the journal.
 
-Counted by plain SQL on the journal, as described in docs/operation.md.
+The query is described in docs/operation.md.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def test_the_plain_sender_writes_a_batch_as_the_golden_file_has_it():
 
 
 class Lot:
-    """Router, map server and plain senders, killed and restarted at will."""
+    """Router, map server, plain senders: killed and restarted at will."""
 
     def __init__(self, folder: Path, children: Children) -> None:
         self.folder, self.endpoint, self._children = folder, free_endpoint(), children
@@ -110,7 +110,7 @@ class Lot:
 
 
 def journal(store: Path) -> Counter[tuple[str, int, int, int]]:
-    """Journalled samples by machine, run, number and stamp, with repetitions."""
+    """Journalled samples by machine, run, number, stamp, with repetitions."""
     counts: Counter[tuple[str, int, int, int]] = Counter()
     with closing(sqlite3.connect(store / "journal.db")) as db:
         for number, record in db.execute("SELECT row, record FROM journal ORDER BY row"):
@@ -129,7 +129,7 @@ def journal(store: Path) -> Counter[tuple[str, int, int, int]]:
 
 
 def recorded(path: Path, machine: str) -> tuple[set[tuple[str, int, int]], int]:
-    """Machine, run and number of recorded, unquarantined samples of a plain sender; and the total."""
+    """Machine, run, number of a plain sender's recorded, unquarantined samples; their total."""
     with closing(sqlite3.connect(path)) as db:
         runs = {place: (int(run), newest) for place, run, newest in db.execute("SELECT place, id, newest FROM run")}
         bad = {(runs[place][0], seq) for place, seq in db.execute("SELECT place, seq FROM quarantine")}

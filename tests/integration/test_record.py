@@ -1,4 +1,4 @@
-"""A recorded site replayed by readings or by samples: the same samples and map."""
+"""A recorded site replayed by readings or samples: equal samples and map."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SIDE_M = 256.0
 
 
 class Recorded:
-    """A site recorded by `sitegrid record` and by agents while two machines drove."""
+    """Recorded by `sitegrid record` and agents, two machines driving."""
 
     def __init__(self, folder: Path, children: Forks) -> None:
         self.children, self.endpoint = children, free_endpoint()
@@ -59,7 +59,7 @@ class Recorded:
         return SiteRun(folder, self.children, self.endpoint, SIM)
 
     def end(self, site: SiteRun) -> tuple[dict[str, bytes], str]:
-        """Samples by machine, and a hash of the whole map, while stopping the server."""
+        """Samples by machine, and the whole map's hash, while stopping the server."""
         with site.connect() as client:
             until(lambda: (info := client.info()).merged == info.journalled, "all is merged")
             region = client.region(Bounds(-SIDE_M, -SIDE_M, SIDE_M, SIDE_M))

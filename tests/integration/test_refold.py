@@ -1,4 +1,4 @@
-"""Decisions about machines in real processes: continued work, kills, ends and full disks at bad moments."""
+"""Decisions in real processes: continued work, kills, ends, full disks at bad moments."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ROWS, FEW_ROWS = 3000, 500  # of 100 samples: the larger fold takes a good part 
 
 @pytest.fixture
 def site(site: SiteRun, request: pytest.FixtureRequest) -> SiteRun:
-    """A site with samples of ten machines and no snapshot."""
+    """Samples of ten machines, no snapshot."""
     (site.folder / "server.toml").write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
     rows = getattr(request, "param", ROWS)
     write_store(site.folder / "store", load_site(site.site_file), rows, tail_rows=rows)
@@ -60,7 +60,7 @@ def fold_without(site: SiteRun, machines: set[str]) -> Grid:
 
 @contextmanager
 def repeated(ask: Callable[[], object]) -> Iterator[list[object]]:
-    """Ask repeatedly on a thread; yields the answers so far."""
+    """Ask repeatedly on a thread; yields its answers."""
     answers, ended = list[object](), threading.Event()
 
     def repeat() -> None:
@@ -107,7 +107,7 @@ def test_batches_and_queries_are_answered_during_a_refold_and_the_map_is_that_of
 
 
 def given(client: Client, machine: str, wait_s: float = 0.0) -> None:
-    """Give a command; it is answered whether or not the map follows in time."""
+    """Give a command; answered whether or not the map follows in time."""
     try:
         client.distrust(machine, "a test", wait_s=wait_s)
     except QueryError as error:

@@ -1,4 +1,4 @@
-"""Edge cases of routes in client, command and HTTP: named machines, restart, refusals; real processes."""
+"""Edge cases of routes by client, command and HTTP in real processes: named machines, restart, refusals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def numbers(line: tuple[Place, ...]) -> list[str]:
 
 
 def asked(site: WebSite, kind: str, places: tuple[Place, ...], values: dict[str, str]) -> dict[str, str]:
-    """Refusals of command and HTTP for a drive that all three refuse; the command's last line."""
+    """Command and HTTP refusals of a drive that all three refuse; the command's last line."""
     settings = [word for name, value in values.items() for word in (f"--{name.replace('_', '-')}", *value.split(","))]
     refused = command(site, kind, *numbers(places), *settings)
     assert refused.code in (1, 2), refused.out
@@ -92,7 +92,7 @@ def blocked(client: Client) -> RouteAnswer:
 
 
 def test_a_way_is_never_dearer_to_drive_than_straight_on(site: WebSite):
-    """Between roads too, over unknown ground, whatever the detour's curves."""
+    """Between roads and over unknown ground too, whatever the detour's curves."""
     for ends in (((40.0, 10.0), (40.0, 130.0)), ((150.0, 10.0), (150.0, 70.0)), ((20.0, 70.0), (90.0, 10.0))):
         for cost, total in (("energy", "energy_j"), ("time", "time_s")):
             way = site.client.ask(WayQuery(*ends, cost, machine=MACHINES["truck"]))

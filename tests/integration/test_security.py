@@ -1,4 +1,4 @@
-"""Access control: real processes with mutual TLS on loopback, and everyone who must not get through."""
+"""Access control with mutual TLS in real processes, and all who must not get through."""
 
 from __future__ import annotations
 
@@ -95,13 +95,13 @@ class Guarded:
         return agent, self.children.start("sim", "sim", *self.network("sim"), *words)
 
     def still_works(self) -> str:
-        """Raises unless a visitor can still read the map; returns a message for assertions."""
+        """Raises unless a visitor reads the map; returns a message for assertions."""
         with connect(self.endpoint, SITE, keys=self.keys / "guest") as client:
             client.info()
         return f"router pid {self.router.pid}, server pid {self.server.pid}"
 
     def batch(self, machine: str) -> bytes:
-        """One sample of a machine in its own spool, as an agent would send it."""
+        """A machine's sample in its own spool, as an agent sends it."""
         rows = np.ones(1, SAMPLE_DTYPE)
         rows["cov_xy_m2"] = rows["applied_zero"] = rows["applied_scale"] = 0.0
         return encode_batch(SampleBatch(machine, time.time_ns(), 1, rows, load_site(self.site_file).frame))
@@ -130,7 +130,7 @@ def is_taken(site: Guarded, session: zenoh.Session, machine: str) -> bool:
 
 @contextlib.contextmanager
 def listening(session: zenoh.Session, key: str) -> Iterator[list[bytes]]:
-    """Arrivals on a key; the router knows of it once a later query is answered."""
+    """Arrivals on a key, known to the router once a later query is answered."""
     received: list[bytes] = []
     subscriber = session.declare_subscriber(key, lambda sample: received.append(sample.payload.to_bytes()))
     assert answers(session, keys.map_query(SITE, "info"))
@@ -139,7 +139,7 @@ def listening(session: zenoh.Session, key: str) -> Iterator[list[bytes]]:
 
 
 def put_until(received: list[bytes], payload: bytes, put: Callable[[], object]) -> None:
-    """Put repeatedly until arrival: routers learn of listeners with a delay."""
+    """Put until arrival: routers learn of listeners late."""
 
     def arrived() -> bool:
         put()
@@ -209,7 +209,7 @@ def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
         with guarded.session("boss") as boss, listening(boss, keys.poses_all(SITE)) as received:
             guest.put(keys.pose(SITE, "loader-1"), b"forged")
             guest.put(keys.pose(SITE, "guest"), b"forged")
-            assert answers(guest, keys.map_query(SITE, "info"))  # earlier puts have been judged
+            assert answers(guest, keys.map_query(SITE, "info"))  # earlier puts were judged
             with guarded.session("loader-1") as loader:
                 put_until(received, b"own", lambda: loader.put(keys.pose(SITE, "loader-1"), b"own"))
             assert set(received) == {b"own"}
@@ -362,7 +362,7 @@ def test_what_is_forged_reaches_nobody(guarded: Guarded, what: str):
         for name, forged in forgers.items():
             for each in forged:
                 sessions[name].put(each, b"forged")
-            answers(sessions[name], keys.map_query(SITE, "info"))  # earlier puts have been judged
+            answers(sessions[name], keys.map_query(SITE, "info"))  # earlier puts were judged
         put_until(received, b"true", lambda: sessions[owner].put(own, b"true"))
         assert set(received) == {b"true"}, guarded.still_works()
 
@@ -454,7 +454,7 @@ def test_a_flood_of_poses_is_thinned_out(guarded: Guarded):
 
 @pytest.mark.nightly
 def test_connections_that_say_nothing_delay_no_link(guarded: Guarded, children: Forks):
-    """At a separate router: each closed connection pauses its listener for 0.1 s, 150 block it for 15 s."""
+    """At a separate router: each closed connection pauses its listener 0.1 s, so 150 block it 15 s."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     router = children.start("router", "router", "--keys", guarded.keys, "--listen", endpoint)
     router.expect("ready", PATIENCE_S)

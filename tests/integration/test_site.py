@@ -1,4 +1,4 @@
-"""The main job in real processes: machines drive, one grid grows, whoever is killed."""
+"""The main job in real processes: driving machines, one growing grid, kills of everyone."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.processes
 
 @dataclass(frozen=True)
 class Kill:
-    """A kill: process ids and merged samples, before it and after the restart."""
+    """Process ids and merged samples before a kill and after the restart."""
 
     pids: tuple[int, int]
     merged: tuple[int, int]
@@ -75,7 +75,7 @@ def shift(tmp_path_factory: pytest.TempPathFactory) -> Shift:
 
 
 def drive_on(client: Client, run: SiteRun) -> None:
-    """Wait until all machines hear the simulator, which announces its end only once."""
+    """Wait until all machines hear the simulator, which announces its end once."""
     first_ns, newest_ns = dict[str, int](), dict[str, int]()
 
     def note(sample: zenoh.Sample) -> None:
@@ -92,7 +92,7 @@ def drive_on(client: Client, run: SiteRun) -> None:
 
 
 def killed(client: Client, victim: Child, start: Callable[[], Child], machine: str = "") -> Kill:
-    """Kill and restart a process; samples continue, of `machine` if its agent was killed."""
+    """Kill and restart a process; samples continue (of `machine`, if its agent was killed)."""
 
     def merged() -> int:
         info = client.info()

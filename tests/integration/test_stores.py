@@ -1,4 +1,4 @@
-"""Runs of real agents continued in another store: refolded, or accepted by a person."""
+"""Agents' runs continued in another store, refolded or accepted by a person."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ SOME = 20  # samples
 
 @pytest.fixture
 def site_run(tmp_path: Path, children: Children) -> SiteRun:
-    """Machines that drive long after all have samples in the map."""
+    """Machines driving on long after all are in the map."""
     return SiteRun(
         tmp_path, children, free_endpoint(), SimConfig(machines=2, seconds=120, speed=8, seed=3, world="fast")
     )
 
 
 def cut_short(site_run: SiteRun) -> str:
-    """A site whose server dies after taking samples; returns its store's id."""
+    """A site whose server dies after accepting samples; returns its store's id."""
     _, server, _ = site_run.start()
     with site_run.connect() as client:
         until(lambda: len(_samples(client)) == site_run.sim.machines, "every machine has samples there")
-        # The next batch follows an acknowledgement: by then the run is bound to the store.
+        # The next batch follows an acknowledgement, which binds the run to the store.
         first = {name: max(samples, SOME) for name, samples in _samples(client).items()}
         more = "every machine has more of them"
         until(lambda: all(n > first[name] for name, n in _samples(client).items()), more)
@@ -43,7 +43,6 @@ def cut_short(site_run: SiteRun) -> str:
 
 
 def _samples(client: Client) -> dict[str, int]:
-    """Samples in the map by machine."""
     return {name: counts.samples for name, counts in client.info().machines.items()}
 
 

@@ -74,7 +74,7 @@ def test_a_server_goes_on_at_the_promoted_replica_when_its_database_is_killed(tm
 
 @pytest.mark.nightly
 def test_of_two_servers_at_a_promoted_replica_and_at_the_old_primary_the_old_one_ends(tmp_path: Path) -> None:
-    """The old primary is still on and waits for no replica: both databases take commits."""
+    """The old primary lives and waits for no replica: both databases take commits."""
     with server.cluster() as primary, Children(tmp_path) as children:
         database = primary.new_database()
         with server.replica(primary, "b") as replica:

@@ -38,7 +38,6 @@ pytestmark = pytest.mark.processes
 
 
 def driven_place(web: WebSite) -> tuple[float, float]:
-    """A place with a value."""
     region = web.client.region((0, 0, 300, 300), ["resistance"])
     rows, columns = np.nonzero(~np.isnan(region["resistance"]))
     return float(region.x_m[columns[7]]), float(region.y_m[rows[7]])
@@ -184,9 +183,9 @@ def test_what_is_no_question_is_refused(web: WebSite):
 
 
 CHUNKED, SECOND = "Transfer-Encoding: chunked", "0\r\n\r\nGET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
-LOST = f"/api/v1/sites/{NAME}/xyz/value/visits/{'9' * 4400}/0/0.png"  # an absurdly long number
-RAW = [  # request and headers -> status of its only answer, before the connection ends
-    ("POST / localhost", ["Content-Length: 6", CHUNKED], 400),  # SECOND is in its body, or behind it
+LOST = f"/api/v1/sites/{NAME}/xyz/value/visits/{'9' * 4400}/0/0.png"  # an absurd number
+RAW = [  # request, headers -> status of its only answer before the end
+    ("POST / localhost", ["Content-Length: 6", CHUNKED], 400),  # SECOND is in or after its body
     ("GET / localhost", [CHUNKED, "Content-Length: 0"], 400),
     ("POST / localhost", ["Content-Length: 5", "Content-Length: 6"], 400),
     ("POST / localhost", ["Content-Length: 5, 5"], 413),
@@ -316,7 +315,7 @@ def test_two_sites_stand_behind_one_address(tmp_path: Path):
 
 
 class Page:
-    """A page without browser; checks that no tile goes back."""
+    """A page without browser; tiles must never go back."""
 
     def __init__(self, web: WebSite) -> None:
         self.web, self.socket = web, None
@@ -330,7 +329,7 @@ class Page:
         return self.socket
 
     def take(self, until: tuple[int, int]) -> None:
-        """Receive until the map has at least this version."""
+        """Receive up to this map version."""
         while self.version < until or not self.frames:
             data = self.socket.recv(timeout=PATIENCE_S)
             if isinstance(data, bytes):
@@ -352,7 +351,7 @@ class Page:
 
 
 def newest(web: WebSite) -> tuple[dict[tuple[int, int], tuple[int, bytes]], tuple[int, int]]:
-    """A fresh snapshot and its version."""
+    """A fresh snapshot, its version."""
     frame = Frame.read(web.get("tiles").body)
     return frame.tiles, frame.version
 

@@ -1,4 +1,4 @@
-"""Foreign tools at the web server: GDAL reads tiles and features like QGIS; schemathesis searches faults."""
+"""Foreign tools at the web server: GDAL reads tiles and features like QGIS; schemathesis looks for faults."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def test_text_is_deflated_for_who_takes_it_and_tiles_are_not_deflated_twice(web:
 
 @pytest.mark.nightly
 def test_a_fuzzer_that_reads_the_description_makes_nothing_fail(web: WebSite, tmp_path: Path):
-    """Right and wrong queries drawn from the API's description: every answer is a promised one."""
+    """Queries drawn from the API's description: every answer is a promised one."""
     checks = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
     drawn = "--max-time 10 --seed 1 --max-examples 40 --phases coverage,fuzzing --generation-database :memory:"
     options = ["--checks", checks, *drawn.split(), *["--suppress-health-check", "all", "--no-color", "--workers", "1"]]

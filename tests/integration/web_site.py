@@ -1,4 +1,4 @@
-"""A site on the web: router, map server and web server as processes; machines drive on demand."""
+"""A site on the web: router, map server, web server as processes; machines drive on demand."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Answer:
 
 
 class WebSite:
-    """Everything runs from the start; `drive` lets the machines work."""
+    """Everything runs at once, machines by `drive`."""
 
     def __init__(self, folder: Path, children: Children, *words: str | Path, machines: int = 3) -> None:
         self.folder, self.children = folder, children
@@ -77,7 +77,7 @@ class WebSite:
         return urlsplit(self.url).port or 0
 
     def drive(self, seconds: float) -> None:
-        """Drive all machines on until their samples are acknowledged."""
+        """Drive all machines on until acknowledged."""
         end_s = self.driven_s + seconds
         while self.driven_s < end_s:
             for machine in self.machines:
@@ -93,7 +93,7 @@ class WebSite:
         return START_NS + round(self.driven_s * 1e9)
 
     def get(self, path: str, parameters: Mapping[str, object] | None = None, **headers: str) -> Answer:
-        """GET a path of the site's API, or any path with a leading slash."""
+        """GET a path of the site's API, or any path with leading slash."""
         if not path.startswith("/"):
             path = f"/api/v1/sites/{NAME}/{path}"
         query = f"?{urlencode(parameters)}" if parameters else ""

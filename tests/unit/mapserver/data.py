@@ -1,4 +1,4 @@
-"""Samples, batches and stores for the tests of the map server."""
+"""Samples, batches and stores for tests of the map server."""
 
 import time
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
@@ -41,7 +41,7 @@ NOW_NS = 1_767_225_600_000_000_000
 
 
 def wait_for(fact: Callable[[], Any]) -> None:
-    """Wait on a condition that has no event of its own."""
+    """Wait on a condition without an event."""
     until(fact, "a test's condition")
 
 
@@ -50,7 +50,7 @@ def now_ns() -> int:
 
 
 def samples(n: int = 1, **columns: Any) -> Table:
-    """Plain samples: one metre each on dry dirt, at the centre of cell (8, 8), unless columns say otherwise."""
+    """Plain samples: 1 m each on dry dirt at the centre of cell (8, 8), unless columns differ."""
     rows = empty(n)
     usual = {"x_m": 8.5, "y_m": 8.5, "distance_m": 1.0, "c_rr": 0.04, "grade_e": 0.1, "grade_n": -0.05}
     usual |= {"stamp_ns": NOW_NS + np.arange(n) * 10**9, "cov_xx_m2": 0.01, "cov_yy_m2": 0.01}
@@ -60,7 +60,7 @@ def samples(n: int = 1, **columns: Any) -> Table:
 
 
 def random_samples(n: int, seed: int, half_m: float = 60.0, std_m: float = 1.5) -> Table:
-    """Samples all over a site around the origin, with full covariances; some without c_rr, some without grade."""
+    """Samples around the origin with full covariances, some without c_rr or grade."""
     draw = np.random.default_rng(seed)
     deviations, correlation = draw.uniform(0.0, std_m, (2, n)), draw.uniform(-0.95, 0.95, n)
     rows = samples(
@@ -93,14 +93,14 @@ def incoming(rows: Table, first_seq: int = 1, machine: str = "a", spool_id: int 
 
 
 def put(journal: Journal, sent: SampleBatch, received_ns: int = NOW_NS, lost: int = 0) -> None:
-    """One batch as one row of a journal."""
+    """One batch as one journal row."""
     journal.begin()
     journal.append(Admission(sent, trimmed=0, lost=lost), received_ns)
     journal.commit()
 
 
 def fold_of(rows: Iterable[JournalRow], without: Container[str] = ()) -> Grid:
-    """The map of journal rows, folded from the first one on."""
+    """Map folded from all rows."""
     grid = Grid(SITE.cell_m, CONFIG.fold)
     for row in rows:
         if row.machine not in without:
@@ -115,12 +115,12 @@ def folded(rows: Table, machine: str = "a", cell_m: float = 1.0, waiting_rows: i
 
 
 def is_by_definition(grid: Grid, rows: Table, machine: str = "a") -> bool:
-    """Whether a grid holds what the reference makes of the same samples, bit for bit."""
+    """Whether a grid equals the reference for these samples, bit for bit."""
     return plain(of_grid(grid)) == plain(by_definition([(machine, rows)], grid.cell_m, grid.config))
 
 
 def total(grid: Grid) -> np.ndarray:
-    """Counts of all cells together, (COUNTS,)."""
+    """Counts summed over cells, (COUNTS,)."""
     counts = np.zeros(ev.COUNTS, np.int64)
     for at in grid.state().pages:
         np.add.at(counts, at.page.votes["place"] // ev.CELLS, at.page.votes["count"].astype(np.int64))
@@ -139,7 +139,7 @@ def same_state(a: GridState, b: GridState) -> bool:
 
 
 def same_evidence(one: Grid, other: Grid) -> bool:
-    """Equal evidence, to the bit, in all blocks, however it is spread over pages."""
+    """Equal evidence in all blocks, to the bit, however paged."""
     if one.bounds() != other.bounds() or (one.folded, one.skipped) != (other.folded, other.skipped):
         return False
     column, row, end_column, end_row = one.bounds() or (0, 0, 1, 1)
@@ -153,7 +153,7 @@ def _bits(at: PlacedPage) -> tuple[object, ...]:
 
 
 def filled_to(state: GridState, count: int) -> GridState:
-    """The same state with every count that is not zero set to this one."""
+    """The state with all non-zero counts replaced."""
     blocks = []
     for x, y, record in state.blocks:
         pages = Pages.unpacked(record)
@@ -162,11 +162,11 @@ def filled_to(state: GridState, count: int) -> GridState:
     return replace(state, blocks=tuple(blocks))
 
 
-APART = {"keep_buckets": 1000}  # so many buckets that a test sees none of them summed
+APART = {"keep_buckets": 1000}  # no test's bucket is ever summed
 
 
 def merged(parts: Iterable[Grid]) -> Grid:
-    """Put together grids that were folded apart."""
+    """Merge separately folded grids."""
     first, *more = parts
     for part in more:
         first.merge(part)
@@ -174,7 +174,7 @@ def merged(parts: Iterable[Grid]) -> Grid:
 
 
 def grid_copy(store: Store) -> Grid:
-    """The map as it is, for another thread than the one that owns the store."""
+    """A map for another thread than the store's owner."""
     return Grid.from_state(store.grid.cell_m, store.grid.config, store.grid.state())
 
 
@@ -198,14 +198,14 @@ def past_of(writer: Writer) -> StorePast:
 
 @contextmanager
 def refused(reason: str, match: str | None = None) -> Iterator[None]:
-    """What is within is refused, for this reason and in these words."""
+    """Refusal for this reason, in these words."""
     with pytest.raises((QueryError, MessageError), match=match) as caught:
         yield
     assert caught.value.reason == reason
 
 
 class Replies:
-    """Collects the answers to batches, in the order in which they come."""
+    """Answers to batches, in order of arrival."""
 
     def __init__(self) -> None:
         self.all: list[tuple[int, Ack | Refused]] = []
@@ -227,7 +227,7 @@ class Replies:
 
 @contextmanager
 def held(writer: Writer) -> Iterator[None]:
-    """Keep the owner's thread busy, so that what is submitted meanwhile waits."""
+    """Block the owner's thread, so submissions wait."""
     entered, release = Event(), Event()
 
     def hold(_: Store) -> None:
@@ -253,7 +253,7 @@ def send(writer: Writer, batches: Sequence[Incoming]) -> list[Ack | Refused]:
 
 @contextmanager
 def routed() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
-    """Two sessions on one router in this process: the router's own, and a client's."""
+    """A router's own session and a client's, in this process."""
     endpoint = free_endpoint()
     router = open_session(SessionConfig(endpoint, mode="router"))
     client = open_session(SessionConfig(endpoint))

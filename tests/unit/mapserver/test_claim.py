@@ -101,7 +101,7 @@ def test_a_server_that_was_cut_off_ends_if_another_one_writes_meanwhile(network:
 
 
 def test_of_two_that_write_since_neither_answered_in_time_the_earlier_one_goes_on(network: Network):
-    """As where one was frozen while the other one asked."""
+    """As if one was frozen while the other asked."""
     with network.writer(FIRST) as first, closing(network.claim(SECOND)) as second:
         second._writes = second.held = True
         second._watch.start()
@@ -120,7 +120,7 @@ def test_whatever_is_asked_is_answered(network: Network):
 
 
 def shared(network: Network, epoch: int, known: int) -> WriterClaim:
-    """The claim of a server with the journal FIRST. known: the newest epoch of its database."""
+    """Claim of a server with the journal FIRST. known: its database's newest epoch."""
     claim = WriterClaim(network.session(), "pit", FIRST, shared=True, known_epoch=lambda: known)
     claim.epoch = lambda: epoch
     return claim
@@ -130,7 +130,7 @@ def test_servers_of_one_journal_let_each_other_be(network: Network):
     with closing(shared(network, 4, 4)) as writer, closing(shared(network, 0, 4)) as standby:
         writer.acquire()
         standby.acquire()
-        end_s = time.monotonic() + 2.5  # two of its questions
+        end_s = time.monotonic() + 2.5  # two of its queries
         wait_for(lambda: writer.superseded or writer.ended or standby.ended or time.monotonic() > end_s)
         assert (writer.held, standby.held) == (True, True)
 
@@ -139,7 +139,7 @@ def test_of_two_servers_that_write_one_journal_in_two_databases_the_lower_epoch_
     with closing(shared(network, 4, 4)) as old, closing(shared(network, 0, 4)) as promoted:
         old.acquire()
         promoted.acquire()
-        promoted.epoch = lambda: 5  # it has taken its turn, in the other database
+        promoted.epoch = lambda: 5  # took its turn in the other database
         wait_for(lambda: old.superseded)
         assert "writes with epoch 5, and this one with 4" in old.superseded
         assert not old.held
@@ -158,7 +158,7 @@ def test_a_standby_whose_database_falls_behind_ends(network: Network):
     with closing(shared(network, 5, 5)) as writer, closing(shared(network, 0, 5)) as standby:
         writer.acquire()
         standby.acquire()
-        writer.epoch = lambda: 6  # in a database that is not the standby's
+        writer.epoch = lambda: 6  # in another database than the standby's
         wait_for(lambda: standby.ended)
         with pytest.raises(LinkError, match="two databases have this journal"):
             standby.require()
@@ -175,7 +175,7 @@ def test_a_take_over_ends_who_writes_and_no_server_that_waits_for_the_same_journ
 
 
 def test_a_take_over_for_another_store_ends_also_who_waits(network: Network):
-    """It would write as soon as the other one has ended."""
+    """It would write as soon as the other ends."""
     with ExitStack() as opened, ThreadPoolExecutor() as threads:
         with closing(shared(network, 4, 4)) as writer, closing(shared(network, 0, 4)) as standby:
             writer.acquire()

@@ -1,4 +1,4 @@
-"""Intervals of cells, segments and routes rest on the same errors."""
+"""Intervals of cells, segments and routes share one error model."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Samples that say no more than where a machine was: they count as driven, and do no harm anywhere."""
+"""Samples with only a position count as driven and do no harm."""
 
 import numpy as np
 

@@ -73,7 +73,7 @@ def refusal(client: zenoh.Session, name: str, parameters: dict[str, str]):
 
 
 def counters(client: zenoh.Session) -> dict[str, int]:
-    """Without those of roads, which are made meanwhile."""
+    """Without those of roads, made meanwhile."""
     counted = codec.decode_info(ask(client, InfoQuery())).counters
     return {name: count for name, count in counted.items() if not name.startswith("roads_")}
 
@@ -107,7 +107,7 @@ def test_a_refused_batch_gets_its_reason(served):
     refused = deliver(client, batch(samples(1), 4))
     assert (refused.reason, refused.expected) == (Refusal.GAP, 1)
     assert deliver(client, batch(samples(1)), machine="b").reason == Refusal.WRONG_MACHINE
-    reply = decode_reply(get(client, keys.ingest("pit", "a")).ok.payload.to_bytes())  # without a payload
+    reply = decode_reply(get(client, keys.ingest("pit", "a")).ok.payload.to_bytes())  # no payload
     assert reply.reason == Refusal.NOT_MSGPACK
     counted = {name: n for name, n in counters(client).items() if name.startswith("refused")}
     assert counted == {"refused_gap": 1, "refused_wrong_machine": 1, "refused_not_msgpack": 1}
@@ -163,7 +163,7 @@ def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
     deliver(client, batch(samples(5)))
     server.close()
     assert not server.failed
-    assert list(client.get(keys.ingest("pit", "a"), payload=b"", timeout=PATIENCE_S)) == []  # nobody listens
+    assert list(client.get(keys.ingest("pit", "a"), payload=b"", timeout=PATIENCE_S)) == []  # no listener
     server = Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)
     ack = deliver(client, batch(samples(0)))
     assert ack == Ack(5, 1, store=ack.store)

@@ -1,4 +1,4 @@
-"""What a process has compiled before it says that it is ready."""
+"""Functions compiled before a process reports ready."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The pages say what the code does: names, limits, and an example that works."""
+"""The pages agree with the code: names, limits, a working example."""
 
 import itertools
 import re

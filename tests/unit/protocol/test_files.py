@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Files are whole or absent."""
 
 import subprocess
 import sys

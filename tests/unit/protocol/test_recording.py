@@ -1,4 +1,4 @@
-"""A recording: readings come back bit for bit, whatever interrupts or damages the file, and validators read it."""
+"""Recordings: readings return bit for bit despite interruption or damage; validators accept them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEED = 7
 
 
 def readings(count: int) -> list[RecordedReading]:
-    """Readings of all kinds: any bits of doubles within the limits, stamps in any order."""
+    """All kinds of readings, any bits of doubles within limits, stamps in any order."""
     draw = random.Random(SEED)
     return [
         RecordedReading(f"loader-{i % 3}", 10**18 + i, reading_of(draw, [*KINDS][i % len(KINDS)])) for i in range(count)
@@ -49,7 +49,7 @@ def written(path: Path, taken: list[RecordedReading]) -> Recording:
 
 
 def exact(taken: list[RecordedReading]) -> list[str]:
-    """With the sign of zero, which equality does not see."""
+    """With the sign of zero, unlike equality."""
     return list(map(repr, taken))
 
 

@@ -1,4 +1,4 @@
-"""Rotations: against SciPy's, one by one and as arrays."""
+"""Rotations against SciPy's, single and as arrays."""
 
 import numpy as np
 import pytest

@@ -305,7 +305,7 @@ def test_on_level_ground_a_gain_unlike_all_others_is_a_fault_and_corrected() -> 
     (first, *_) = [each for each in result.corrections if each.machine == "d"]
     assert first.scale == pytest.approx(0.6 / 1.6, abs=0.05)
     assert {each.scale for each in result.corrections if each.machine != "d"} == {0.0}
-    two = solve({"a": rows["a"], "d": rows["d"]})  # nobody knows which of them is wrong
+    two = solve({"a": rows["a"], "d": rows["d"]})  # which of them is wrong is unknown
     assert all(state.beyond[1] < FAULT_SIGMAS[1] for state in two.machines.values())
 
 
@@ -372,7 +372,7 @@ def test_nothing_is_solved_of_nothing() -> None:
 
 @pytest.mark.nightly
 def test_a_hundred_machines_take_a_gigabyte_at_most() -> None:
-    """What they know of four hours each is bounded: of all together a solve takes so many epochs."""
+    """Bounded evidence of four hours each: a solve takes a bounded number of epochs."""
     of_each = ledgers(
         {
             str(i): drive(route, Errors(0.002 * i, 0.02 * i), seconds=4 * 3600.0, seed=i, late=False)
@@ -384,7 +384,7 @@ def test_a_hundred_machines_take_a_gigabyte_at_most() -> None:
     result = calibrate(stays)
     most_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert most_bytes < 0.7e9  # beside what the program itself takes
+    assert most_bytes < 0.7e9  # beyond the program's own memory
     assert len(result.corrections) == MOST_EPOCHS
     assert result.common.observed
     one = calibrate({name: newest(stays[name], epochs_of_each(3)) for name in ("m000", "m001", "m002")})

@@ -1,4 +1,4 @@
-"""Corrected samples: the errors of a sample undone, and nothing else changed."""
+"""Corrected samples: errors undone, nothing else changed."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_errors_are_undone_ahead_and_in_reverse_on_level_ground_and_on_slopes(di
     right = corrected(wrong, [correction(errors.zero, errors.scale, errors.across)])
     for name in ("grade_e", "grade_n"):
         assert np.abs(right[name] - true[name]).max() < 1e-5, name
-    # what noise is in the balance counts as drive force too, so that the scale is undone in it
+    # noise in the balance counts as drive force too, so the scale is undone in it
     off = right["c_rr"].astype(np.float64) - true["c_rr"]
     assert abs(off.mean()) < 3e-4
     assert np.abs(off).max() < 0.01
@@ -76,7 +76,7 @@ def test_each_span_has_its_own_correction_and_rows_of_none_stay_bytes_as_they_we
 
 
 def calibrated_by_itself(rows: Table, zero: Floats, scale: Floats) -> Table:
-    """What the machine would have sent with these zeros and scales (n,) applied: agents/estimation/ground.py."""
+    """As sent by a machine with these zeros and scales (n,) applied: agents/estimation/ground.py."""
     out = rows.copy()
     d, heading = np.where(rows["speed_mps"] >= 0, 1.0, -1.0), rows["heading_rad"].astype(np.float64)
     c, s = np.cos(heading), np.sin(heading)

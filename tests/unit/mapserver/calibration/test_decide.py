@@ -1,4 +1,4 @@
-"""Which corrections count: hysteresis of the solver, people above it, events, and spans painted over each other."""
+"""Valid corrections: solver hysteresis, people's precedence, events, overlapping spans."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
 from mapserver.calibration.ledger import EPOCH_NS, Stated
 from mapserver.calibration.select import CommonScale
 
-SURE = ((2.5e-7, 0.0, 0.0), (0.0, 2.5e-5, 0.0), (0.0, 0.0, 2.5e-7))  # 0.5e-3, 0.5 %, 0.5e-3
+SURE = ((2.5e-7, 0.0, 0.0), (0.0, 2.5e-5, 0.0), (0.0, 0.0, 2.5e-7))  # std 0.5e-3, 0.5 %, 0.5e-3
 NOW_NS = 1000 * EPOCH_NS
 
 
@@ -41,7 +41,7 @@ def solved(*corrections: Correction, begins_ns: int = LAST_NS) -> Solution:
 
 
 class Solver:
-    """Solves one after the other, a minute apart; what is decided counts at once."""
+    """Consecutive solves, a minute apart; decisions are effective at once."""
 
     def __init__(self, *decisions: CalibrationDecision) -> None:
         self.decisions = CalibrationDecisions(decisions)
@@ -50,7 +50,7 @@ class Solver:
     def hears(
         self, *corrections: Correction, asked: bool = False, after_ns: int = 60 * 10**9, begins_ns: int = LAST_NS
     ) -> int:
-        """How many corrections are decided."""
+        """Number of corrections decided."""
         made = self.decisions.judge(solved(*corrections, begins_ns=begins_ns), self.now_ns, asked=asked)
         for decision in made:
             self.decisions.add(CalibrationDecision.from_body(json.loads(json.dumps(decision.body()))))
@@ -58,7 +58,7 @@ class Solver:
         return sum(len(decision.corrections) for decision in made)
 
     def watches(self, time_ns: int, *corrections: Correction) -> None:
-        """So long, while solves say nothing new."""
+        """For this time, with unchanged solves."""
         for _ in range(time_ns // EVERY_NS):
             self.hears(*corrections, after_ns=EVERY_NS)
 
@@ -69,7 +69,7 @@ class Solver:
 
 
 def test_the_first_correction_of_a_machine_counts_at_once():
-    """Until then its samples are off by all of its zero, and nobody knows another map."""
+    """Earlier samples have all of its zero's error, and no other map is known."""
     solver = Solver()
     assert [solver.hears(one(0.003)) for _ in range(3)] == [1, 0, 0]
     assert solver.zero() == 0.003
@@ -110,9 +110,9 @@ def test_the_solver_decides_at_most_once_in_ten_minutes_of_site_time_unless_it_i
 @pytest.mark.parametrize(
     ("begun_min", "decided"),
     [
-        (0, [0, 3, 7, 15, 25]),  # 1, 4, 8, 16 minutes after the first sample; from then on every 10
+        (0, [0, 3, 7, 15, 25]),  # 1, 4, 8, 16 minutes after the first sample, then every 10
         (-60, [0, 10, 20]),
-        (1, [0, 3, 6, 12, 22]),  # the first sample came with the first decision
+        (1, [0, 3, 6, 12, 22]),  # first sample with the first decision
         (10**6, [0, 10, 20]),  # a clock is ahead
     ],
 )
@@ -216,7 +216,7 @@ def test_painted_spans_are_what_painting_each_time_by_itself_gives():
         ({}, {}, 0),
         ({"a": 900 * EPOCH_NS}, {}, 900),
         ({"a": 1002 * EPOCH_NS}, {}, 1000),
-        ({}, {1000: Stated(0.001)}, 1000),  # what was before was sent with the machine's own zero of then
+        ({}, {1000: Stated(0.001)}, 1000),  # earlier samples had the machine's own zero
     ],
 )
 def test_the_first_correction_of_a_machine_is_that_of_all_its_samples_before(begins, applied, expected):
@@ -258,7 +258,7 @@ def test_what_the_solver_says_again_is_as_of_now():
 
 
 def test_what_is_known_of_a_machine_that_stands_is_as_of_its_last_epoch():
-    """Others drive on, so that it is solved for again and again; nothing of it is known by that."""
+    """Others drive on, so it is solved for repeatedly without new evidence."""
     solver = Solver()
     solver.now_ns += EVERY_NS
     own = [one(0.003, epoch) for epoch in (999, 1000)]
@@ -269,13 +269,13 @@ def test_what_is_known_of_a_machine_that_stands_is_as_of_its_last_epoch():
 
 
 def unknown(zero: float, epoch: int, across_std: float = 0.0045, **more: float) -> Correction:
-    """Of samples on slopes nothing was known."""
+    """No samples on slopes."""
     covariance = np.diag([1e-6, 2e-3, across_std**2]).tolist()
     return one(zero, epoch, most_share=LEVEL_SHARE, covariance=covariance, **more)
 
 
 def test_a_scale_and_a_lateral_zero_that_are_found_late_are_those_of_all_samples():
-    """Else the map would step where they were found, and the ground would seem to have changed there."""
+    """Else the map would step at the time of discovery, like changed ground."""
     solver = Solver()
     old = [unknown(0.002 * (i + 1), 1000 + i) for i in range(3)]
     solver.watches(2 * EVERY_NS, *old)
@@ -294,7 +294,7 @@ def test_a_scale_and_a_lateral_zero_that_are_found_late_are_those_of_all_samples
 
 
 def test_what_was_shown_of_a_scale_then_stays():
-    """Where a machine was mended since, it was right then; and a fault was not always there."""
+    """After a repair, an earlier finding was right for its time; and faults begin somewhere."""
     solver = Solver()
     solver.watches(2 * EVERY_NS, one(0.001, scale=0.08))
     later = one(0.001, 1100, scale=-0.02)
@@ -321,7 +321,7 @@ def test_what_is_wanted_of_machines_waits_for_the_next_decision_whoever_is_solve
 
 
 def test_what_cannot_be_decided_now_is_not_forgotten():
-    """The map does not follow yet, or nothing could be written: the caller adds nothing."""
+    """The map is behind or nothing could be written: the caller adds nothing."""
     decisions = CalibrationDecisions()
     for minute in range(2):
         made = decisions.judge(solved(one(0.003)), NOW_NS + minute)

@@ -1,4 +1,4 @@
-"""Equations whose ground is eliminated say what the whole system says."""
+"""Equations with eliminated ground equal the whole system."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ N, UNKNOWNS = 300, 20
 
 
 def system(seed: int, blocks: int, parameters: int = 7) -> Equations:
-    """Random equations whose ground is tied together in blocks."""
+    """Random equations with block-coupled ground."""
     draw = np.random.default_rng(seed)
     A = sp.random(N, parameters, 0.4, "csr", random_state=draw)
     first = draw.integers(0, UNKNOWNS // 2, N)

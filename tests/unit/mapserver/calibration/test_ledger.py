@@ -1,4 +1,4 @@
-"""Ledgers depend on no order, remember the newest epochs, and keep what samples say."""
+"""Ledgers: independent of order, newest epochs kept, content of the samples."""
 
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ def test_far_places_and_floods_of_samples_do_no_harm() -> None:
     flood = np.repeat(rows[:1], 5000)
     p, _, _ = passages({"a": stays_of([rows, far, flood])})
     assert np.isfinite(p.along).all()
-    assert len(p) == len(passages({"a": stays_of([rows])})[0]) - 1  # the stay of the flood
+    assert len(p) == len(passages({"a": stays_of([rows])})[0]) - 1  # the flood's stay
 
 
 def test_nobody_drove_where_a_position_jumped() -> None:

@@ -1,4 +1,4 @@
-"""What was observed once stays, until something contradicts it; what nobody can be named for is not applied."""
+"""Observed corrections hold until contradicted; those of nobody identifiable are not applied."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from tests.unit.mapserver.calibration.drives import (
 
 S = 10**9
 ERRORS = {"a": Errors(0.0, 0.2), "b": Errors(0.002, 0.0), "c": Errors(0.004, 0.03)}
-BOTH = ((20.0, 10.0), (110.0, 10.0))  # up and down the ramp, in one lane
+BOTH = ((20.0, 10.0), (110.0, 10.0))  # up and down the ramp, one lane
 ROUTES = {"a": RAMP, "b": RAMP_AGAIN, "c": RAMP}
 SURE = ((1.6e-7, 0.0, 0.0), (0.0, 1.6e-5, 0.0), (0.0, 0.0, 1.6e-7))
 KNOWN = [Correction(name, 0, 1, 0.0, e.scale / (1 + e.scale), 0.0, SURE) for name, e in ERRORS.items()]
 
 
 def test_a_scale_that_was_observed_stays_where_nothing_shows_it_any_more() -> None:
-    """On a ramp for 15 minutes, then on the level, until no evidence of the ramp is left."""
+    """15 minutes on a ramp, then level until no evidence of the ramp is left."""
     sites, decisions = {name: StayLedger() for name in ERRORS}, CalibrationDecisions()
     for quarter in range(3):
         for i, (name, ledger) in enumerate(sites.items()):
@@ -62,12 +62,12 @@ def test_a_scale_that_was_observed_stays_where_nothing_shows_it_any_more() -> No
 
 
 def paved(x_m: Floats, y_m: Floats, heading: Floats) -> Floats:
-    """Ramps of better ground than what is around them."""
+    """Ramps on better ground than around."""
     return soils(x_m, y_m, heading) - 0.02 * (height_slope(x_m) > 0)
 
 
 def borders(x_m: Floats, y_m: Floats, _: Floats) -> Floats:
-    """Borders of soils at the foot of two of three lanes."""
+    """Soil borders at the foot of two of three lanes."""
     return 0.03 + 0.02 * ((y_m < 17.0) & (x_m > FOOT_M)) + 0.02 * ((y_m > 32.0) & (x_m < FOOT_M))
 
 
@@ -105,7 +105,7 @@ def test_only_scales_that_were_observed_are_remembered() -> None:
 
 
 def applied(rows: Table, zero: Floats | float) -> Table:
-    """What a machine sends that takes this zero off itself."""
+    """Sent by a machine that takes off this zero."""
     out = rows.copy()
     out["c_rr"] -= np.sign(rows["speed_mps"]) * zero
     out["grade_e"] += zero * np.cos(rows["heading_rad"])
@@ -127,7 +127,7 @@ def test_a_machine_that_applied_nonsense_is_corrected_though_its_sensor_is_good(
     true = drive(LOW, Errors(), seconds=900.0)
     corrections = decided({"a": applied(true, 0.02)}).corrections
     right = corrections.applied(applied(true, 0.02), ["a"], np.zeros(len(true), np.int64))
-    firm = true["c_rr"] < 0.07  # where the scale is not known, samples of large shares stay as they are
+    firm = true["c_rr"] < 0.07  # with an unknown scale, samples of large shares stay unchanged
     assert abs(np.mean((right["c_rr"] - true["c_rr"])[firm])) < 0.001
     assert decided({"a": true}).corrections.each == ()
 

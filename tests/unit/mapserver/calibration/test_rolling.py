@@ -1,4 +1,4 @@
-"""Machines that roll unlike the others: soft tyres, a dragging brake, lies; and what must not be taken for one."""
+"""Machines rolling unlike others: soft tyres, dragging brakes, lies; and lookalikes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def driven(name: str, errors: Errors | None = None) -> Table:
 
 
 def rolling(rows: Table, share: float, drag: float = 0.0) -> Table:
-    """As of a machine that rolls harder, or says so: its slopes are right."""
+    """Of a machine that rolls harder, or says so; its slopes are right."""
     out = rows.copy()
     out["c_rr"] += share * rows["c_rr"] + drag
     return out
@@ -44,7 +44,7 @@ def rolling(rows: Table, share: float, drag: float = 0.0) -> Table:
 
 @cache
 def solved(*odd: tuple[str, float, float]) -> tuple[Solution, Mapping[str, Table]]:
-    """The fleet, of which these machines roll harder by a share and a drag; its solve, and its corrected samples."""
+    """Solve and corrected samples of the fleet, with these machines rolling harder by a share and a drag."""
     harder = {name: (share, drag) for name, share, drag in odd}
     rows = {name: rolling(driven(name), *harder.get(name, (0.0, 0.0))) for name in FLEET}
     result = calibrate(ledgers(rows))
@@ -52,7 +52,7 @@ def solved(*odd: tuple[str, float, float]) -> tuple[Solution, Mapping[str, Table
 
 
 def unlike(result: Solution) -> dict[str, bool]:
-    """Machines that are said to roll unlike the others, and whether they are named for it."""
+    """Machines reported as rolling unlike others, and whether they are named."""
     return {name: state.rolling.is_named for name, state in result.machines.items() if state.rolling}
 
 
@@ -104,7 +104,7 @@ def test_against_most_that_lie_alike_the_honest_one_is_odd_and_of_two_nobody_is_
 
 @pytest.mark.slow
 def test_rain_between_machines_is_nobody_s_tyres() -> None:
-    """One drives before it and comes back for five minutes after it, which is not enough to know."""
+    """One drives before it and for five minutes after it: too short."""
     wet: Site = lambda x, y, h: 1.3 * soils(x, y, h)  # noqa: E731
     late: dict[str, Floats | float] = {"start_s": SECONDS}
     rows = {

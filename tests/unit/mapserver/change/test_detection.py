@@ -31,7 +31,7 @@ BIN = float(np.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0]))
 
 
 def passes(*grounds: float, column: str = "c_rr", distance_m: float = 1.0, noise: float = 0.0) -> TimedPages:
-    """Pages of one block that is driven all over once an hour, with the ground as given."""
+    """Pages of a block fully driven once an hour, with this ground."""
     x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
     grid, draw = Grid(1.0, FoldConfig(keep_buckets=100)), np.random.default_rng(1)
     for hour, ground in enumerate(grounds):
@@ -120,7 +120,7 @@ def test_a_change_is_more_than_its_samples_state_by_machines_and_by_passes(machi
 
 
 def two_passes(*grounds: dict[float, float]) -> TimedPages:
-    """Pages of one block that is driven all over twice; for each pass the metres on each kind of ground."""
+    """Pages of a block fully driven twice; per pass the metres by ground."""
     x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
     grid = Grid(1.0, FoldConfig())
     for hour, metres in enumerate(grounds):
@@ -149,13 +149,13 @@ def test_less_evidence_than_weight_on_either_side_is_no_change(old_is_less):
         assert firsts(two_passes({0.04: old}, {0.2: new})) == [change]
 
 
-# Ground of bin 10 in 80 x 80 cells, of which some are changed to bin 15 from a time on.
+# Ground of bin 10 in 80 x 80 cells, some changed to bin 15 at a time.
 OLD, NEW, NEW_NS = 10.0, 15.0, 300e9
 
 
 def believed(changed: Bools, kind: Floats, now: Floats, fresh: Bools | None = None, config: ChangeConfig = CONFIG,
              cell_m: float = 1.0) -> Bools:  # fmt: skip
-    """What is credible of changed cells; fresh: cells that were not driven before the change."""
+    """Credible changed cells; fresh: not driven before the change."""
     cut = Cuts(changed.astype(np.int64), kind, np.where(changed, 0.0, np.nan), np.where(changed, NEW_NS, np.nan))
     from_ns = np.where(np.isnan(now), np.nan, 0.0 if fresh is None else np.where(fresh, NEW_NS, 0.0))
     return credible(cut, Known(now, from_ns, np.where(np.isnan(now), np.nan, 2 * NEW_NS)), cell_m, config)
@@ -168,7 +168,7 @@ def square(width: int, height: int | None = None, column: int = 32, row: int = 3
 
 
 def counts(changed: Bools, kind: float = NEW, beside: Bools | None = None, cell_m: float = 1.0, size_m: float = 5.0):
-    """What is credible of an area that changed to a kind, with ground that always was `NEW` somewhere beside it."""
+    """Credible part of an area changed to a kind, with old `NEW` ground beside it."""
     now: Floats = np.full(changed.shape, OLD)
     now[changed if beside is None else changed | beside] = NEW
     kinds = np.where(changed, kind, np.nan)
@@ -194,8 +194,8 @@ def test_a_strip_of_the_kind_of_the_ground_beside_is_a_border_that_moved(width, 
     strip = square(width, 40)
     assert not counts(strip, beside=beside).any()
     assert not counts(strip.T, beside=beside.T).any()
-    assert np.array_equal(counts(strip), strip)  # and without that ground, it is new
-    assert np.array_equal(counts(strip, beside=square(20, 40, 32 + width + 11)), strip)  # nor if that is far
+    assert np.array_equal(counts(strip), strip)  # new without that ground
+    assert np.array_equal(counts(strip, beside=square(20, 40, 32 + width + 11)), strip)  # nor with it far away
 
 
 def test_an_area_twice_as_wide_is_believed_beside_its_like_too():
@@ -211,8 +211,8 @@ def test_a_change_without_resistance_must_be_twice_as_wide():
 
 def test_size_is_in_metres():
     assert counts(square(6), cell_m=1.0, size_m=3.0).any()
-    assert not counts(square(6), cell_m=0.4, size_m=3.0).any()  # 8 cells, and 6 are too few
-    assert counts(square(1), cell_m=5.0, size_m=3.0).sum() == 1  # never less than a cell
+    assert not counts(square(6), cell_m=0.4, size_m=3.0).any()  # 8 cells; 6 are too few
+    assert counts(square(1), cell_m=5.0, size_m=3.0).sum() == 1  # at least one cell
 
 
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 75), (75, 0), (75, 75), (20, 75)])
@@ -256,7 +256,7 @@ def crop(images: Cuts | Known, part: slice):
 @pytest.mark.parametrize("size_m", [1.0, 5.0, 6.0])
 @pytest.mark.parametrize("seed", range(2))
 def test_what_a_cell_shows_depends_on_the_blocks_near_it_alone(seed, size_m):
-    """Queries of a point and of the whole map see other images, and have to say the same."""
+    """Queries of points and whole maps see different images but must agree."""
     rng, n = np.random.default_rng(seed), 9 * BLOCK_CELLS
     config = replace(CONFIG, size_m=size_m)
     patches = [cv2.resize(rng.random((n // edge, n // edge)), (n, n)) for edge in (3, 6, 16)]
@@ -329,7 +329,7 @@ PARTS = [ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH]
 
 
 def made_up(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Votes of four pages packed, where each page's end, and the same as counts (pages, COUNTS, 256)."""
+    """Packed votes of four pages, page ends, and the counts (pages, COUNTS, 256)."""
     rng = np.random.default_rng(seed)
     counts = rng.integers(0, 5000, (4, ev.COUNTS, ev.CELLS)) * (rng.random((4, ev.COUNTS, ev.CELLS)) < 0.01)
     flat = counts.reshape(4, -1)
@@ -384,7 +384,7 @@ def test_the_best_cut_is_the_likeliest(seed):
 
 
 def median(votes: np.ndarray) -> np.ndarray:
-    """Where half of the votes (bins, cells) lie below, each bin's spread evenly around it."""
+    """Median of votes (bins, cells), each bin's spread evenly around it."""
     until = np.vstack([np.zeros(votes.shape[1]), (votes / votes.sum(axis=0)).cumsum(axis=0)])
     return np.array([np.interp(0.5, column, np.arange(len(column)) - 0.5) for column in until.T])
 

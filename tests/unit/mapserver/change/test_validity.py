@@ -19,18 +19,18 @@ from tests.unit.mapserver.data import NOW_NS, samples
 HOUR_NS = 3600 * 10**9
 CONFIG = ChangeConfig()
 OLD, NEW = 0.04, 0.2
-PASSES = 4  # the last of them finds the ground repaved
+PASSES = 4  # the last finds repaved ground
 
 
 def lane(hour: int, west: float, south: float, wide: int, high: int, **ground: float):
-    """One sample in the middle of each cell of an area, within four minutes."""
+    """A sample per cell centre of an area, within four minutes."""
     x, y = (axis.ravel() + 0.5 for axis in np.meshgrid(west + np.arange(wide), south + np.arange(high)))
     stamps = NOW_NS + hour * HOUR_NS + np.arange(x.size) * 240 * 10**9 // x.size
     return samples(x.size, x_m=x, y_m=y, stamp_ns=stamps, cov_xx_m2=0.04, cov_yy_m2=0.04, **ground)
 
 
 def repaved(west: float, south: float, size: int, **options: int) -> Grid:
-    """A site of 64 x 64 cells around the origin, driven every hour; an area is repaved before the last pass."""
+    """64 x 64 cells around the origin, driven hourly; an area is repaved before the last pass."""
     grid = Grid(1.0, FoldConfig(**options))
     for hour in range(PASSES):
         rows = lane(hour, -32, -32, 64, 64, c_rr=OLD)
@@ -76,8 +76,8 @@ def test_a_repaved_area_is_seen_after_one_pass_and_the_rest_stays(place):
     assert np.allclose(value[inside], NEW, rtol=0.05)
     assert np.allclose(value[outside], OLD, rtol=0.05)
     assert not now.changed_ns[outside].any()
-    assert now.weight[inside].max() < 2 * ev.WEIGHT_UNITS_PER_M  # of one pass
-    assert now.weight[outside].min() > (PASSES - 2) * ev.WEIGHT_UNITS_PER_M  # of all
+    assert now.weight[inside].max() < 2 * ev.WEIGHT_UNITS_PER_M  # one pass
+    assert now.weight[outside].min() > (PASSES - 2) * ev.WEIGHT_UNITS_PER_M  # all passes
 
 
 @pytest.mark.parametrize("keep_buckets", [1, 2, 3])
@@ -89,7 +89,7 @@ def test_a_change_is_dated_also_where_old_passes_are_summed(keep_buckets):
 
 
 def test_a_change_is_dated_after_the_last_old_sample_of_the_same_span():
-    """Old and new evidence within one hour: the hour begins before the old sample."""
+    """Old and new evidence within an hour, which begins before the old sample."""
     grid = Grid(1.0, FoldConfig(keep_buckets=1))
     stamps = [NOW_NS, NOW_NS + 300 * 10**9, NOW_NS + 1200 * 10**9]
     for stamp_ns, c_rr in zip(stamps, (OLD, OLD, NEW), strict=True):
@@ -136,7 +136,7 @@ def test_a_change_stays_found_where_the_rest_of_its_block_is_driven_on(days):
 def test_bits_and_newest_stamp_are_those_of_the_evidence_that_holds():
     now, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
     outside = ~area(-5, 4, 10, 1)
-    assert np.bitwise_count(now.bitmaps[..., ev.VISITS])[inside].max() <= 5  # the minutes of the last pass
+    assert np.bitwise_count(now.bitmaps[..., ev.VISITS])[inside].max() <= 5  # minutes of the last pass
     assert np.bitwise_count(now.bitmaps[..., ev.VISITS])[outside].min() >= PASSES - 1
     assert (now.newest_ns >= NOW_NS + (PASSES - 1) * HOUR_NS).all()
 
@@ -144,7 +144,7 @@ def test_bits_and_newest_stamp_are_those_of_the_evidence_that_holds():
 def ages_of(begin_ns: int, cells: slice) -> dict[tuple[int, int], np.ndarray]:
     begins = np.zeros(ev.CELLS, np.int64)
     begins[cells] = begin_ns
-    return {(0, 0): begins, (90, 90): begins}  # the last one has no evidence
+    return {(0, 0): begins, (90, 90): begins}  # the last has no evidence
 
 
 def firsts(grid: Grid, begin_ns: int, config: ChangeConfig = CONFIG) -> tuple[np.ndarray, list]:
@@ -167,7 +167,7 @@ def test_where_nothing_was_driven_since_the_page_of_the_change_counts():
     first, pages = firsts(grid, last_ns + 60 * 10**9)
     assert {pages[i].first_ns for i in first[:128].tolist()} == {last_ns}
     first, _ = firsts(grid, last_ns + 100 * HOUR_NS)
-    assert (first == 0).all()  # after all that is known: better old than nothing
+    assert (first == 0).all()  # after all evidence: better old than none
 
 
 def test_an_age_before_a_change_of_the_cells_takes_nothing_back():
@@ -211,7 +211,7 @@ def change_log(kept=(), **options) -> ChangeLog:
 
 @pytest.fixture
 def repaved_grid() -> Grid:
-    """40 x 40 m of wet dirt, driven twice; a part of it is gravel an hour later."""
+    """40 x 40 m of wet dirt driven twice, part of it gravel an hour later."""
     grid = Grid(1.0, FoldConfig())
     for hour in (0, 1):
         grid.fold(sweep(0, 0, 40, 40, 0.06, hour), "a")
@@ -235,7 +235,7 @@ def test_a_change_is_logged_once(repaved_grid):
     repaved_grid.touch_all()
     assert look(log, repaved_grid) == []
     repaved_grid.fold(sweep(10, 10, 30, 25, 0.02, 3), "b")
-    assert [c.id for c in look(log, repaved_grid)] in ([], [1])  # a few cells at its edge may be new
+    assert [c.id for c in look(log, repaved_grid)] in ([], [1])  # edge cells may be new
 
 
 def test_a_change_grows_while_machines_pass():

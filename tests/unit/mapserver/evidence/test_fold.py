@@ -20,7 +20,7 @@ UNITS = ev.WEIGHT_UNITS_PER_M
 HOUR_NS = 3600 * 10**9
 
 
-# Rows of every kind that the door admits: what is unknown, what stands still, what is nowhere, what is at a border.
+# All admissible kinds of row: unknown, still, nowhere, at borders.
 edge = st.sampled_from([-32.0, -16.0, -0.5, 0.0, 7.5, 15.999, 16.0])
 wide = st.one_of(st.floats(-40, 40), edge)
 unknown = st.just(np.nan)
@@ -40,7 +40,7 @@ sample = st.fixed_dictionaries({
 
 
 def admitted(drawn: list[dict[str, float]], shrunk: float = 1.0):
-    """Samples as drawn, their standard deviations made smaller; the door admits every one of them."""
+    """Samples as drawn with smaller standard deviations, all admitted."""
     column = {name: np.array([one[name] for one in drawn]) for name in drawn[0]}
     x, y = column.pop("std_x") * shrunk, column.pop("std_y") * shrunk
     column["cov_xy_m2"] = 0.999 * column.pop("correlation") * x * y
@@ -73,13 +73,13 @@ def test_a_stencil_of_many_blocks_is_what_the_definition_says(monkeypatch):
     assert is_by_definition(grid, rows)
     assert len(grid.state().pages) > 16
     assert total(grid)[ev.HEADING].sum() == 2 * 100 * UNITS
-    monkeypatch.setattr("mapserver.evidence.fold.MOST_SHARES", 100)  # one sample at a time
+    monkeypatch.setattr("mapserver.evidence.fold.MOST_SHARES", 100)  # a sample at a time
     assert same(folded(rows, cell_m=0.2), grid)
 
 
 @pytest.mark.parametrize("batch", [1500, 12_000])
 def test_no_count_wraps_before_it_is_packed(batch):
-    """Two headings of 6000 samples fit into 32 bits, what they share does not."""
+    """Two headings of 6000 samples fit 32 bits, their common counts do not."""
     n, weight = 12_000, 100 * UNITS
     heading = np.where(np.arange(n) % 2, np.pi, 0.0)
     rows = samples(n, distance_m=100.0, cov_xx_m2=0, cov_yy_m2=0, heading_rad=heading, grade_e=0.125, stamp_ns=NOW_NS)
@@ -111,7 +111,7 @@ def test_a_sample_too_uncertain_is_counted_not_folded(cap):
     grid = folded(rows, std_cap_m=cap)
     assert (grid.folded, grid.skipped) == (2, 2)
     oblique = samples(cov_xx_m2=0.9 * cap**2, cov_yy_m2=0.9 * cap**2, cov_xy_m2=0.5 * cap**2)
-    assert folded(oblique, std_cap_m=cap).skipped == 1  # sure east and north, but not along the diagonal
+    assert folded(oblique, std_cap_m=cap).skipped == 1  # certain east and north, not along the diagonal
 
 
 def test_bucket_length_decides_the_buckets():
@@ -144,7 +144,7 @@ Batches = list[tuple[str, Table]]
 
 
 def batches(seed: int, *, n: int = 150, days: float = 1.0, spread_m: float = 8.0, machines: int = 3) -> Batches:
-    """Samples with everything that is hard: unknown values, unsure and tilted positions, no way driven, any order."""
+    """Hard samples: unknown values, uncertain and tilted positions, no distance, any order."""
     rng = np.random.default_rng(seed)
     rows = empty(n)
     rows["stamp_ns"] = START_NS + (rng.random(n) * days * DAY_NS).astype(np.int64)

@@ -26,7 +26,7 @@ def test_window_finds_the_blocks_that_it_touches(window, expected):
 
 
 def test_counts_are_kept_while_folding_and_fold_nothing(monkeypatch):
-    """Through folds, merges and snapshots; what waits is counted at once, its cells and bounds once it is folded."""
+    """Through folds, merges and snapshots; waiting samples count at once, their cells and bounds once folded."""
     grid, parts = Grid(1.0, FoldConfig(), 200), [random_samples(90, seed, std_m=4.0) for seed in range(5)]
     for part in parts[:4]:
         grid.fold(part, "a")
@@ -134,7 +134,7 @@ def test_blocks_are_touched_once_until_they_are_folded_into_again():
 
 
 def test_a_cell_and_bucket_that_machines_drive_take_few_bytes():
-    """A page takes about 45, and this fails when that grows."""
+    """A page takes about 45 bytes; this guards it."""
     draw, n = np.random.default_rng(0), 4000
     turn = np.cumsum(draw.normal(0, 0.02, n))
     rows = samples(

@@ -19,7 +19,7 @@ SPACE = Space()
 
 
 def page(bucket: int, weight: int = 1, cells: tuple[int, ...] = (5,)) -> Record:
-    """A page of these cells, with the bucket's own stamp and a vote of this weight in each."""
+    """A page of these cells with the bucket's stamp and a vote of this weight each."""
     numbers = np.array(sorted(cells), np.uint64)
     known = np.zeros(len(cells), CELL)
     known["cell"], known["visits"], known["machines"], known["newest_ns"] = numbers, 1, 1, bucket * BUCKET_S * S + 7
@@ -52,7 +52,7 @@ def places(line: Timeline, tiers: Tiers = FEW) -> list[tuple[int, int]]:
 
 
 def by_definition(buckets, keeps: tuple[int, int, int]) -> set[tuple[int, int]]:
-    """Which pages there are: the newest of each length apart, what is older by the next length."""
+    """Existing pages: the newest of each length single, older ones by the next length."""
     kept, left, spans = set(), set(buckets), (1, PER_HOUR, PER_DAY)
     for tier, (keep, span) in enumerate(zip(keeps, spans, strict=True)):
         index = {bucket: bucket // span for bucket in left}
@@ -90,7 +90,7 @@ def test_what_stays_apart_is_decided_cell_by_cell(driven, keeps, random):
 def test_many_timelines_are_settled_as_each_by_itself():
     spans = [range(1), range(3), range(0, 500, 7), range(2), range(40, 0, -1)]
     alone, together = ([timeline(START + np.array(buckets)) for buckets in spans] for _ in range(2))
-    for _ in range(2):  # first from nothing, then beside what is kept
+    for _ in range(2):  # from nothing, then beside kept pages
         settle_all(together[:-1], FEW, SPACE, least=3)
         assert [line.waiting for line in together] == [1, 0, 0, 2, 40]
         settle_all(together, FEW, SPACE)
@@ -181,7 +181,7 @@ def test_pages_come_back_from_their_record_to_the_bit(drawn_pages):
 
 
 def summed(pages: TimedPages, start: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Counts, bitmaps and newest stamps of a block, page by page, as `evidence` has them."""
+    """A block's counts, bitmaps and newest stamps by page, like `evidence`."""
     counts, bitmaps = np.zeros((256, ev.COUNTS), np.uint64), np.zeros((256, 2), np.uint64)
     newest_ns = np.zeros(256, np.int64)
     for index, one in enumerate(pages):

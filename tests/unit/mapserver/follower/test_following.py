@@ -1,4 +1,4 @@
-"""A follower of a real journal: equal to the server bit for bit, whatever happens to the journal."""
+"""A follower of a real journal equals the server bit for bit, whatever happens to the journal."""
 
 import os
 import shutil
@@ -52,7 +52,7 @@ from tests.unit.mapserver.data import (
     wait_for,
 )
 
-pytestmark = pytest.mark.slow  # a writer and a follower each, and waits of theirs
+pytestmark = pytest.mark.slow  # writer, follower and waits in each
 
 
 @contextmanager
@@ -135,7 +135,7 @@ def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_pa
             writer.run(lambda store, t=trusted: store.decide(TrustDecision("b", t, PERSON, "drawn", NOW_NS)))
             wait_for(lambda n=1 + trusted: one._replica.tail.event == n)
             wait_for(lambda: folds == [1])
-        assert version(one).fact == 2  # the map has what decisions come to
+        assert version(one).fact == 2  # the map has the decisions' net effect
         may_go_on.set()
         wait_for(lambda: one._anew is None)
         deliver(writer, 2)
@@ -200,7 +200,7 @@ def test_any_course_of_rows_decisions_and_starts_makes_the_same_map(tmp_path_fac
 
 @dataclass(frozen=True)
 class Course:
-    """What goes on after the first row of each of two machines: other rows, and a decision about a machine."""
+    """Events after each of two machines' first row: other rows, a decision about a machine."""
 
     seeds: tuple[int, ...] = ()
     decides: str = ""
@@ -212,7 +212,7 @@ class Course:
                 deliver(writer, seed, machine="ab"[seed % 2])
             for name in self.decides:
                 writer.run(lambda store, name=name: store.decide(TrustDecision(name, False, PERSON, "drifts", NOW_NS)))
-            if self.archives:  # the journal itself has none of them any more, and all numbers are the same
+            if self.archives:  # none left in the journal, equal numbers
                 assert archive_all(folder, writer)
             return writer.run(lambda store: store.version)
 
@@ -351,7 +351,7 @@ def test_rows_that_cannot_be_read_for_a_while_are_in_the_map_once(tmp_path, monk
             deliver(writer, seed)
         with following(tmp_path) as one:
             catches_up(one, writer)
-            with one._lock:  # it sees all of them at once
+            with one._lock:  # all visible at once
                 for seed in range(4, 8):
                     deliver(writer, seed, machine="b")
             catches_up(one, writer)
@@ -371,7 +371,7 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
         "UPDATE sitegrid.head SET last_row = 1; DELETE FROM sitegrid.watermark WHERE spool_id <> '\\x0000000000000001'"
     )
     with closing(store_at(JournalLocation(tmp_path / "other", database.url))) as other:
-        for seed in (4, 5, 6):  # another host's server goes on
+        for seed in (4, 5, 6):  # another host's server continues
             other.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
         one = Following(location, SITE, CONFIG)
         one.start()
@@ -446,7 +446,7 @@ def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_
 
 
 def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch):
-    def lost(self, known, timeout_s):  # the notification; the time-out is not
+    def lost(self, known, timeout_s):  # the notification, not the time-out
         wait_for(lambda: True)
         return self.state()
 
@@ -469,12 +469,12 @@ def test_a_damaged_row_behind_a_sound_one_takes_no_map_away(tmp_path, caplog):
             record[60] ^= 1
             db.execute("UPDATE journal SET record = ? WHERE row = 3", (bytes(record),))
 
-        with one._lock:  # it sees both rows at once
+        with one._lock:  # both rows visible at once
             for seed in (2, 3):
                 deliver(writer, seed)
             writer.run(damage)
         wait_for(lambda: "journal row 3" in caplog.text)
-        wait_for(lambda: one.behind()[1] > 2.5)  # it has opened the journal again
+        wait_for(lambda: one.behind()[1] > 2.5)  # reopened journal
         assert version(one).row == 2
         assert one.behind()[0] == 1
         assert "rows are gone" not in caplog.text

@@ -32,11 +32,11 @@ def numbers(admission) -> list[int]:
 @pytest.mark.parametrize(
     ("first", "n", "watermark", "new", "trimmed"),
     [
-        (1, 5, 0, [1, 2, 3, 4, 5], 0),  # the first of all
-        (4, 2, 3, [4, 5], 0),  # follows
-        (1, 5, 3, [4, 5], 3),  # overlaps
-        (1, 5, 5, [], 5),  # a whole duplicate
-        (1, 5, 9, [], 5),  # long since there
+        (1, 5, 0, [1, 2, 3, 4, 5], 0),  # first of all
+        (4, 2, 3, [4, 5], 0),  # consecutive
+        (1, 5, 3, [4, 5], 3),  # overlapping
+        (1, 5, 5, [], 5),  # duplicate
+        (1, 5, 9, [], 5),  # long known
     ],
 )
 def test_what_is_there_already_is_trimmed(first, n, watermark, new, trimmed):
@@ -70,9 +70,9 @@ DAY = 86_400 * 10**9
 @pytest.mark.parametrize(
     ("ahead_ns", "seen", "reason"),
     [
-        (DAY + 1, SeenTime(), Refusal.FAR_FUTURE),  # a new store
-        (73 * 365 * DAY, SeenTime(NOW_NS, NOW_NS + DAY, NOW_NS), Refusal.FAR_FUTURE),  # the year 2099
-        (3 * DAY, SeenTime(NOW_NS + DAY, NOW_NS + DAY), Refusal.FAR_FUTURE),  # ahead of all others, too
+        (DAY + 1, SeenTime(), Refusal.FAR_FUTURE),  # new store
+        (73 * 365 * DAY, SeenTime(NOW_NS, NOW_NS + DAY, NOW_NS), Refusal.FAR_FUTURE),  # year 2099
+        (3 * DAY, SeenTime(NOW_NS + DAY, NOW_NS + DAY), Refusal.FAR_FUTURE),  # ahead of all others
         (3 * DAY, SeenTime(0, NOW_NS + DAY, NOW_NS), Refusal.FAR_FUTURE),  # its own earlier stamps prove nothing
         (3 * DAY, SeenTime(0, 0, NOW_NS + 1), Refusal.SERVER_CLOCK),  # the server's clock went back
         (3 * DAY, SeenTime(0, NOW_NS + DAY + 1), Refusal.SERVER_CLOCK),
@@ -89,7 +89,7 @@ def test_a_stamp_a_day_ahead_of_all_that_is_known_is_refused_with_its_row(clock,
     ("ahead_ns", "seen"),
     [
         (DAY, SeenTime()),
-        (3 * DAY, SeenTime(NOW_NS + 2 * DAY, NOW_NS + 2 * DAY)),  # as the others say: the server's clock is behind
+        (3 * DAY, SeenTime(NOW_NS + 2 * DAY, NOW_NS + 2 * DAY)),  # agrees with others: the server's clock is behind
         (-(10**18), SeenTime()),  # a log of 1994
     ],
 )
@@ -113,9 +113,9 @@ def test_a_gap_is_taken_and_counted_where_all_of_it_is_declared_lost(lost_before
 @pytest.mark.parametrize(
     ("first", "lost_before", "watermark", "expected"),
     [
-        (8, 4, 3, (7, 4)),  # samples 4 to 7 will never come, and none after them
-        (8, 9, 3, (7, 4)),  # some of them came before
-        (8, 3, 3, (3, 0)),  # 4 is not declared: it may still come
+        (8, 4, 3, (7, 4)),  # samples 4 to 7 are lost and none follow
+        (8, 9, 3, (7, 4)),  # some came before
+        (8, 3, 3, (3, 0)),  # 4 is not declared: may still come
         (4, 3, 3, (3, 0)),
         (2, 1, 3, (3, 0)),
     ],
@@ -153,7 +153,7 @@ def beside(value: float, kind: type) -> list[float]:
 
 
 def edges(name: str) -> list[float]:
-    """Values of a column around all that decides."""
+    """Values around a column's limits."""
     kind = SAMPLE_DTYPE[name].type
     low, high = LIMITS.get(name, (-EXTENT_M, EXTENT_M))
     near = [*beside(low, kind), *beside(high, kind)]
@@ -211,7 +211,7 @@ CONFIG = FoldConfig()
 
 
 def drive(draw: np.random.Generator, km: float, std_m: float, bend: float) -> Table:
-    """A drive over ground that nobody has seen, each position off by an error of its own of up to 3 std."""
+    """A drive over new ground with position errors of up to 3 std."""
     n = round(2000 * km)
     driven, heading = draw.uniform(0.25, 0.75, n), draw.uniform(0, 6) + np.cumsum(draw.normal(0, bend, n))
     x_m, y_m = np.cumsum(driven * [np.cos(heading), np.sin(heading)], axis=1) + std_m * draw.uniform(-2.1, 2.1, (2, n))
@@ -230,7 +230,7 @@ def batches(rows: Table, draw: np.random.Generator) -> Iterator[Table]:
 
 
 def taken(credit: BlockCredit, rows: Table) -> int:
-    """How many samples are taken of a sender that halves what is refused, and gives up what is refused alone."""
+    """Samples accepted from a sender that halves refused batches and drops single refused samples."""
     try:
         credit.spend("a", rows)
     except MessageError:
@@ -254,7 +254,7 @@ def test_an_honest_drive_is_taken_whole_with_gaps_and_jumps(cell_m: float, std_m
 
 
 @pytest.mark.parametrize("distance_m", [0.5, 100.0])
-@pytest.mark.parametrize("stay", [0, 1, 10, 100])  # samples at a place, to and fro by 2 m; 0: on a line, 85 m apart
+@pytest.mark.parametrize("stay", [0, 1, 10, 100])  # samples per place, to and fro by 2 m; 0: on a line, 85 m apart
 @pytest.mark.parametrize("std_m", [2.9, 50.0])  # of every other sample; a large one has no vote
 def test_whoever_scatters_opens_what_its_metres_pay_for(stay: int, distance_m: float, std_m: float):
     draw, n = np.random.default_rng(2), 2000
@@ -264,7 +264,7 @@ def test_whoever_scatters_opens_what_its_metres_pay_for(stay: int, distance_m: f
     rows["distance_m"], rows["cov_xx_m2"][::2] = distance_m, std_m**2
     for part in batches(rows, draw):
         taken(credit, part)
-    driven_m = min(distance_m, 5.0) * n  # a sample each second
+    driven_m = min(distance_m, 5.0) * n  # a sample per second
     assert len(credit.opened) <= 200 + (credit.jumps_per_m + credit.per_m) * driven_m
     assert len(credit.opened) <= 200 + 0.1 * driven_m or stay in (0, 100), "to and fro pays for no jumps"
     assert len(credit.opened) <= 200 or stay != 1, "and a jump earns nothing"
@@ -294,7 +294,7 @@ EVERYWHERE = [(x, y) for x in range(-320, 320) for y in range(-320, 320)]  # 10 
 
 
 @pytest.mark.parametrize("names", [1, 300])
-@pytest.mark.parametrize("every_s", [0.001, 30.0])  # all in a bucket of time, or in many
+@pytest.mark.parametrize("every_s", [0.001, 30.0])  # all in one time bucket, or in many
 @pytest.mark.parametrize("known", [[], EVERYWHERE])
 def test_memory_goes_with_what_was_driven(known: list[tuple[int, int]], every_s: float, names: int):
     draw, n = np.random.default_rng(5), 10_000
@@ -315,7 +315,7 @@ def test_memory_goes_with_what_was_driven(known: list[tuple[int, int]], every_s:
 )
 @pytest.mark.parametrize("known", [[], EVERYWHERE])
 def test_no_honest_machine_meets_it_fast_or_slow(known: list[tuple[int, int]], mps: float, hz: float, std_m: float):
-    """The last one is parked, and its positions wander: each sample is half a metre that its wheels did not drive."""
+    """The last is parked with wandering positions: half a metre per sample not driven by its wheels."""
     draw, n = np.random.default_rng(6), 10_000
     heading, step_m = np.cumsum(draw.normal(0, 0.02, n)), mps / hz
     x_m, y_m = np.cumsum(step_m * np.stack([np.cos(heading), np.sin(heading)]), axis=1) + draw.normal(0, std_m, (2, n))

@@ -120,7 +120,7 @@ def test_what_is_refused_or_not_committed_is_neither_journalled_nor_paid_for(sto
 def test_info_tells_the_state_in_plain_values(store):
     far = samples(2, cov_xx_m2=10.0, x_m=900.0, stamp_ns=NOW_NS + 10**12)
     store.commit([incoming(samples(3)), incoming(samples(2), spool_id=8), incoming(far, machine="b")])
-    store.grid.known_cells()  # folds what waits: cells and bounds follow then
+    store.grid.known_cells()  # folds waiting samples, on which cells and bounds follow
     info = store.info()
     assert (info["samples_merged"], info["samples_too_unsure"], info["cells"]) == (5, 2, 1)
     assert (info["bounds"], info["stamp_ns"]) == ((0, 0, 16, 16), NOW_NS + 10**12)
@@ -148,7 +148,7 @@ def test_an_adopted_grid_gets_what_came_since_without_those_excluded(store, row)
     assert (store.merged, store.journalled) == (5, 5)
 
 
-# Takes batches of 20 samples; in the fold of number `stuck`, half of its pages are in the grid, and nothing goes on.
+# Takes batches of 20 samples; hangs in fold number `stuck` with half its pages in the grid.
 TAKES = """
 import signal
 import sys
@@ -182,7 +182,7 @@ for i, part in enumerate(np.split(np.load(folder / "rows.npy"), 10)):
 
 @contextmanager
 def taking(folder, stuck: int, saved: int) -> Iterator[subprocess.Popen]:
-    """A process that takes batches until it folds number `stuck`; killed at the end."""
+    """A process taking batches until fold number `stuck`, killed at the end."""
     words = [sys.executable, "-c", f"import sys; sys.path[:0] = {sys.path!r}\n" + TAKES, folder, str(stuck), str(saved)]
     child = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     try:
@@ -207,7 +207,7 @@ def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, sa
         assert child.wait(20) == -signal.SIGKILL
     store = open_store(tmp_path / "store")
     assert store.snapshot_row == (saved if saved < stuck else 0)
-    assert (store.merged, store.journalled) == (stuck, stuck)  # committed, though never acknowledged
+    assert (store.merged, store.journalled) == (stuck, stuck)  # committed, never acknowledged
     assert same(store.grid, folded(rows[: 20 * stuck]))
     answers = store.commit([incoming(part, 1 + 20 * i) for i, part in enumerate(np.split(rows, 10))])
     assert [answer.trimmed for answer in answers] == [20] * stuck + [0] * (10 - stuck)
@@ -227,12 +227,12 @@ def test_a_run_that_is_bound_to_another_store_is_refused_until_a_person_accepts_
         assert store.identity.id in refused.problem
         assert (store.journalled, store.machines()) == (0, {})
         store.accept(GONE, "its disk died")
-        store.accept(GONE, "its disk died")  # once more changes nothing
+        store.accept(GONE, "its disk died")  # idempotent
         assert len(store.journal.events("accepted_store")) == 1
-    with closing(open_store(tmp_path)) as store:  # it holds after a restart
+    with closing(open_store(tmp_path)) as store:  # holds after a restart
         assert store.info()["accepted"] == [GONE]
         assert store.commit([bound])[0] == Ack(5, 1, 0, store.identity.id, replaces=GONE)
-        assert store.machines()["a"]["lost"] == 3  # what only the other store has is counted
+        assert store.machines()["a"]["lost"] == 3  # samples only in the other store are counted
         assert store.commit([incoming(samples(1), 6, store=store.identity.id)])[0].replaces == ""
 
 
@@ -259,7 +259,7 @@ def test_a_server_whose_clock_went_back_says_so_until_it_is_right_again(tmp_path
         clock[0] -= 300 * DAY
         monday = incoming(samples(1, stamp_ns=NOW_NS + 403 * DAY), 2)
         assert store.commit([monday])[0].reason == Refusal.SERVER_CLOCK
-    # it is known from the journal, too
+    # also known from the journal
     with closing(Store(JournalLocation(tmp_path), SITE, CONFIG, lambda: clock[0])) as store:
         assert store.commit([monday])[0].reason == Refusal.SERVER_CLOCK
         clock[0] += 303 * DAY
@@ -302,7 +302,7 @@ def test_a_snapshot_beyond_the_journal_is_named_before_it_is_removed(tmp_path, c
 def test_samples_that_are_missing_are_counted_until_they_are_declared_lost(tmp_path, caplog):
     store = open_store(tmp_path)
     store.commit([incoming(samples(3))])
-    store.journal._mark.write({f"a {7:016x}": 5, f"b {8:016x}": 2})  # as a journal that was longer had
+    store.journal._mark.write({f"a {7:016x}": 5, f"b {8:016x}": 2})  # as of a longer journal
     store.close()
     store = open_store(tmp_path)
     assert {name: entry["missing"] for name, entry in store.machines().items()} == {"a": 2, "b": 2}
@@ -320,13 +320,13 @@ COVARIANCE = ((4e-7, 1e-7, 0.0), (1e-7, 2e-5, 0.0), (0.0, 0.0, 1e-6))
 
 
 def calibrated(machine, *spans, by=SOLVER, stamp_ns=NOW_NS):
-    """A decision about a machine: spans of from_ns, to_ns, zero, covariance."""
+    """Decision about a machine: spans of from_ns, to_ns, zero, covariance."""
     corrections = tuple(Correction(machine, start, end, zero, 0.05, 0.0, cov) for start, end, zero, cov in spans)
     return CalibrationDecision(machine, by, "", stamp_ns, corrections)
 
 
 def offered(store, machine="a"):
-    """What comes with the acknowledgement of one more sample."""
+    """The offer with the next sample's acknowledgement."""
     seq = store.journal.watermark(machine, 7).seq + 1
     table = store.commit([incoming(samples(1), seq, machine=machine)])[0].offer
     return table and decode_offer(table)
@@ -345,9 +345,9 @@ def test_a_machine_is_offered_what_is_taken_off_its_newest_samples(store):
 @pytest.mark.parametrize(
     ("end_ns", "covariance", "most_share", "trusted"),
     [
-        (NOW_NS, COVARIANCE, 1.0, True),  # it has ended
-        (LAST_NS, (), 1.0, True),  # of unknown quality
-        (LAST_NS, COVARIANCE, NO_SHARE, True),  # of a sensor that measures no force
+        (NOW_NS, COVARIANCE, 1.0, True),  # ended
+        (LAST_NS, (), 1.0, True),  # unknown quality
+        (LAST_NS, COVARIANCE, NO_SHARE, True),  # no force sensor
         (LAST_NS, COVARIANCE, 1.0, False),
     ],
 )
@@ -410,7 +410,7 @@ def location(tmp_path: Path, database: Database) -> JournalLocation:
 
 @pytest.fixture
 def standby(tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch) -> Iterator[Standby]:
-    """One that reads row by row, and tries again at once."""
+    """A standby reading row by row, retrying at once."""
     for name in ("ROWS_AT_ONCE", "BYTES_AT_ONCE"):
         monkeypatch.setattr(postgres_reader, name, 1)
     monkeypatch.setattr(following, "MOST_PAUSE_S", 0.0)
@@ -488,7 +488,7 @@ def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
 
 
 def restore(database: Database, row: int) -> None:
-    """As a backup of the same epoch would have it."""
+    """From a backup of the same epoch."""
     database.sql(f"DELETE FROM sitegrid.journal WHERE row > {row}; DELETE FROM sitegrid.extent WHERE row > {row}")
     database.sql(f"UPDATE sitegrid.head SET last_row = {row}")
 
@@ -514,7 +514,7 @@ def test_a_database_that_is_restored_within_an_epoch_is_folded_again(location, s
 
 
 def test_a_decision_of_another_course_is_not_kept(location, standby, database):
-    """A restored database may have another decision under the number of one that is gone."""
+    """A restored database may reuse a lost decision's number."""
     with closing(store_at(location)) as store:
         send(store, 1, 4)
         send(store, 1, 4, machine="b")

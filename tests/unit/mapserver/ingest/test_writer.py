@@ -58,7 +58,7 @@ def start(tmp_path):
 
 
 def spied(monkeypatch, method: str) -> list[str]:
-    """Record the calls of a method of Journal; a test may add what else happens."""
+    """Record the calls of a Journal method; tests may add side effects."""
     events: list[str] = []
     real = getattr(SqliteJournal, method)
 
@@ -108,7 +108,7 @@ def test_batches_that_follow_closely_are_committed_together_and_keep_no_work_wai
     monkeypatch.setattr(writer_module, "COMMIT_EVERY_S", 0.3)
     events = spied(monkeypatch, "commit")
     writer, replies = start(clock=Clock()), Replies()
-    assert isinstance(send(writer, [incoming(samples(1))])[0], Ack)  # at once: nothing was committed before
+    assert isinstance(send(writer, [incoming(samples(1))])[0], Ack)  # at once: no commit before
     for i in (1, 2, 3):
         writer.submit(incoming(samples(1), i + 1), replies[i])
     assert writer.run(lambda store: store.journalled) == 1
@@ -164,7 +164,7 @@ def test_a_look_is_taken_by_whoever_asks_while_the_owner_waits(start):
 
 
 def test_nobody_looks_while_the_owner_commits(start, monkeypatch):
-    """Batches and looks of several threads: none ever sees a map in the making."""
+    """Concurrent batches and looks: nobody sees a half-made map."""
     writer, both, ended = start(), list[tuple[int, int]](), threading.Event()
 
     def look() -> None:
@@ -243,14 +243,14 @@ def test_after_a_bug_a_restart_folds_what_was_committed(start, monkeypatch, tmp_
         writer.submit(incoming(samples(4)), lambda _: None)
         wait_for(lambda: writer.failed)
         writer.close()
-    assert snapshot_rows(tmp_path) == []  # a grid that may be half-folded is not kept
+    assert snapshot_rows(tmp_path) == []  # a half-folded grid is not kept
     again = start()
     assert send(again, [incoming(samples(4))]) == [Ack(4, 1, trimmed=4, store=writer.store_id)]
     assert again.info()["samples_merged"] == 4
 
 
 def table(**fields: Any) -> bytes:
-    """A good batch with some fields replaced; None takes one out."""
+    """A valid batch with replaced fields; None removes one."""
     good = msgpack.unpackb(encode_batch(batch(samples(2), 1)))
     return msgpack.packb({k: v for k, v in (good | fields).items() if v is not None})
 
@@ -317,9 +317,9 @@ def test_a_group_is_bounded_in_bytes_and_never_empty():
 def test_the_newest_of_the_machine_with_most_bytes_gives_way():
     backlog = filled("aaab", limit=40)
     assert backlog.add("c", 10, "c1") == ["a3"]
-    assert backlog.add("c", 10, "c2") == ["c2"]  # as much as anybody has
+    assert backlog.add("c", 10, "c2") == ["c2"]  # as much as anybody
     assert backlog.add("d", 10, "d1") == ["a2"]
-    assert backlog.add("e", 10, "e1") == ["e1"]  # all have one
+    assert backlog.add("e", 10, "e1") == ["e1"]  # one each
     assert backlog.take() == ["a1", "b1", "c1", "d1"]
 
 
@@ -334,7 +334,7 @@ def test_the_time_until_there_is_room_follows_the_pace():
     for _ in range(100):
         pace.worked(2_000_000, 0.5)
     assert 0.9 < pace.retry_after_s(4_000_000) < 1.1
-    pace.worked(1, 0.0)  # a clock that stood still
+    pace.worked(1, 0.0)  # a stopped clock
     assert pace.retry_after_s(10**12) == MOST_RETRY_S
 
 

@@ -1,4 +1,4 @@
-"""What every journal promises, whichever database keeps it."""
+"""The contract of all journals, for every database."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.unit.mapserver.data import NOW_NS, SITE, batch, fold_of, incoming, ra
 
 @dataclass
 class Place:
-    """Where a test's journal is. sql: runs a statement on a connection of its own."""
+    """A journal's place. sql: run a statement on another connection."""
 
     location: JournalLocation
     sql: Callable[[str], Any]
@@ -238,7 +238,7 @@ def test_damage_is_found_on_opening(place, monkeypatch, change, problem):
 
 
 def test_samples_at_minus_zero_are_no_damage(place):
-    """Databases make 0.0 of -0.0, whose bits are others."""
+    """Databases turn -0.0 into 0.0, of other bits."""
     rows = samples(3, x_m=[-0.0, -0.0, 5.0], y_m=[-7.0, -0.0, -0.0])
     with closing(place.open()) as journal:
         write(journal, Admission(batch(rows), trimmed=0, lost=0), Admission(batch(rows[1:2], 4), trimmed=0, lost=0))
@@ -248,7 +248,7 @@ def test_samples_at_minus_zero_are_no_damage(place):
 
 
 def test_losses_beyond_what_the_wire_has_can_be_asked_for(place):
-    """What one machine says that it lost must not keep the state of all others from being read."""
+    """One machine's declared loss must not block reading all others' state."""
     most = 2**62
     with closing(place.store()) as store:
         for spool_id in range(1, 7):
@@ -268,7 +268,7 @@ def test_another_schema_is_refused(place):
 
 
 class Faults:
-    """Fails the n-th statement of a journal: before it runs, or after it, as where its answer is lost."""
+    """Fails the n-th statement of a journal, before it runs or after it, as with a lost answer."""
 
     def __init__(self, number: int, mode: str) -> None:
         self.left, self.mode, self.happened = number, mode, False
@@ -291,7 +291,7 @@ class Faults:
             if self.mode == "answer lost":
                 real(*words)
             if self.mode != "full" and isinstance(journal, PostgresJournal):
-                with journal._session._turn:  # its own thread may be asking just now
+                with journal._session._turn:  # its own thread may be asking
                     journal._session._lose("the connection was cut")
             raise UnwrittenError(journal.where, "the disk is full")
 
@@ -330,7 +330,7 @@ def test_after_a_fault_at_any_statement_nothing_is_lost_or_double(place, number,
 
 
 def assert_whole(store: Store, sent: dict[str, Any]) -> None:
-    """Each sample is in the journal once, bit for bit, and the grid is the fold of them."""
+    """Each sample is in the journal once, bit for bit, and the grid is their fold."""
     there: dict[str, list[bytes]] = {machine: [] for machine in sent}
     for row in history_rows(store.history):
         there[row.machine] += [sample.tobytes() for sample in row.rows]

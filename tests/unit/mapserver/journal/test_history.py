@@ -38,7 +38,7 @@ PARTS = {name: np.split(random_samples(200, seed, half_m=25.0), 10) for seed, na
 
 @pytest.fixture(scope="module", params=[0, 3, 20], ids=lambda rows: f"{rows} archived")
 def store(request, tmp_path_factory) -> Iterator[History]:
-    """Twenty rows of two machines, some or all of them in the archive; nothing writes to it."""
+    """Twenty rows of two machines, some or all archived; never written to."""
     folder = tmp_path_factory.mktemp("store")
     journal = SqliteJournal(folder / "journal.db", SITE.name, SITE.frame)
     for i in range(10):
@@ -62,7 +62,7 @@ def test_archive_and_journal_are_one(store, after, until):
 
 @pytest.mark.parametrize("where", [0, 7, 20, 25])
 def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
-    """More rows than are read at once; archiving overtakes a reader that stands at any of them, twice."""
+    """More rows than one read; archiving overtakes the reader twice, at any of them."""
     journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
     journal.begin()
     for i in range(600):
@@ -320,7 +320,7 @@ def test_a_file_cut_short_is_found(file, share):
 
 
 def test_damaged_statistics_do_not_hide_rows(file, day):
-    """A filter that passes over a file trusts its footer, so that is checked even where nothing else is read."""
+    """Skipping a file by filter trusts its footer, so that is always checked."""
     path, _ = file
     data = bytearray(path.read_bytes())
     data[-60] ^= 1
@@ -350,7 +350,7 @@ def test_what_is_no_file_of_this_archive_is_refused(day, tmp_path, monkeypatch):
 
 
 def with_values(name: str, change: Callable[[np.ndarray], object]) -> Callable[[pa.Table], pa.Table]:
-    """A table with other values in a column, as a stranger's file has them."""
+    """A table with changed values, as in a foreign file."""
 
     def changed(table: pa.Table) -> pa.Table:
         values = table.column(name).to_numpy(zero_copy_only=False).copy()
@@ -391,7 +391,7 @@ STRANGE = {
 
 @pytest.mark.parametrize("name", STRANGE)
 def test_a_file_of_a_stranger_is_refused_in_one_line_for_what_it_holds(file, name):
-    """Its seal is right: anybody can make one."""
+    """Its seal is right, as anybody can make one."""
     path, _ = file
     change, problem = STRANGE[name]
     header, table = pq.read_metadata(path).metadata[archive_file.KEY], pq.read_table(path)
@@ -424,7 +424,7 @@ def test_two_files_with_the_same_row_are_an_error(day):
 
 
 class Crash(BaseException):
-    """Whatever ends a process at once."""
+    """Any sudden end of the process."""
 
 
 STEPS = {"write_parquet": ar, "seal": ar, "sync_folder": ar, "sync_folder of the temporary file": files, "_compare": ar}
@@ -492,7 +492,7 @@ YEAR_NS = 365 * 24 * HOUR_NS
 
 
 def test_rows_that_came_in_next_year_keep_nothing_from_the_archive(tmp_path):
-    """The server's clock was a year ahead for two rows; they count for the hour in which the next right row came in."""
+    """Two rows came with the server's clock a year ahead; they belong to the next right row's hour."""
     with opened(tmp_path) as machines:
         for hours, off_ns in ((0, 0), (0, YEAR_NS), (1, YEAR_NS), (1, 0), (2, 0), (5, 0)):
             machines.send(3, NOW_NS + hours * HOUR_NS + off_ns)
@@ -500,7 +500,7 @@ def test_rows_that_came_in_next_year_keep_nothing_from_the_archive(tmp_path):
         names = machines.archive(NOW_NS + 3 * HOUR_NS, now_ns=now_ns)
         spans = ("00_000001-000001", "01_000002-000004", "02_000005-000005")
         assert names == [f"2026-01-01T{span}.parquet" for span in spans]
-        assert machines.both() == before  # also when each came in, as the journal has it
+        assert machines.both() == before  # also receive times, as in the journal
 
 
 def test_rows_that_came_in_next_year_wait_for_one_that_did_not(tmp_path):
@@ -515,7 +515,7 @@ def test_rows_that_came_in_next_year_wait_for_one_that_did_not(tmp_path):
 
 
 def test_a_file_that_is_not_the_journal_s_is_never_a_reason_to_forget(day):
-    """The journal was restored from a backup, and went on with other rows."""
+    """The journal was restored from a backup and continued with other rows."""
     path = next_file(day.folder, day.reader, SITE, FUTURE)
     third = list(day.reader.read())[2]
     with closing(sqlite3.connect(day.journal.path, isolation_level=None)) as db:

@@ -63,7 +63,7 @@ def admission(n: int = 3, first_seq: int = 1, lost: int = 0, **more) -> Admissio
 
 @pytest.mark.parametrize(
     "change", [0, 8, 16, 24, 32, 33, 40, -5, -1, "x''", "x'00'", "'text'", "5", "zeroblob(300)"]
-)  # a bit of each field, the name, the samples, the checksum; another record
+)  # a bit of each field, name, samples, checksum; another record
 def test_a_damaged_row_is_detected(journal, change):
     write(journal, admission(), admission(first_seq=4), admission(first_seq=7))
     if isinstance(change, int):
@@ -72,7 +72,7 @@ def test_a_damaged_row_is_detected(journal, change):
         change = f"x'{record.hex()}'"
     sql(journal, f"UPDATE journal SET record = {change} WHERE row = 2")
     rows = journal.read()
-    assert next(rows).row == 1  # what is before it can be used
+    assert next(rows).row == 1  # earlier rows are usable
     with pytest.raises(StoreError, match=r"journal\.db: journal row 2 is damaged"):
         next(rows)
     assert [r.row for r in journal.read(after=2)] == [3]
@@ -90,7 +90,7 @@ def numbers(rows) -> list[int]:
 
 @pytest.fixture
 def placed(journal):
-    """Rows of machines a, b, a, b; row i lies at x = 10 i .. 10 i + 4, y = -x, with stamps 100 i .. 100 i + 2."""
+    """Rows of machines a, b, a, b; row i at x = 10 i .. 10 i + 4, y = -x, stamps 100 i .. 100 i + 2."""
     seqs = {"a": 1, "b": 1}
     for i in (1, 2, 3, 4):
         x_m, machine = 10.0 * i + np.array([0.0, 4.0, 2.0]), "ab"[(i + 1) % 2]
@@ -124,7 +124,7 @@ def test_reads_by_time_place_and_machine(placed, selection, expected):
 
 
 def test_many_rows_are_one_table(journal, monkeypatch):
-    """Names of all lengths that share beginnings; a machine's rows lie between those of others."""
+    """Names of all lengths with common prefixes; machines' rows interleave."""
     monkeypatch.setattr("mapserver.journal.sqlite.reader.BYTES_AT_ONCE", 2**17)
     machines = ["a", "ab", "b", "a" * 63, "a" * 62 + "b", *(f"loader-{i}" for i in range(300))]
     drawn = np.random.default_rng(8).choice(machines, 900).tolist()
@@ -152,13 +152,13 @@ def test_samples_are_selected_from_many_rows(placed):
 
 
 def test_a_reader_in_the_middle_holds_no_lock_on_the_log(journal, monkeypatch):
-    monkeypatch.setattr("mapserver.journal.sqlite.reader.BYTES_AT_ONCE", 1)  # the fewest rows at a time
+    monkeypatch.setattr("mapserver.journal.sqlite.reader.BYTES_AT_ONCE", 1)  # fewest rows at a time
     write(journal, *(admission(1, first_seq=i + 1) for i in range(300)))
     reader = SqliteReader(journal.path)
     rows = reader.read()
     next(rows)
     write(journal, admission(1, first_seq=301))
-    assert sql(journal, "PRAGMA wal_checkpoint(TRUNCATE)")[0][0] == 0  # 1 would be: busy
+    assert sql(journal, "PRAGMA wal_checkpoint(TRUNCATE)")[0][0] == 0  # 1: busy
     assert len(list(rows)) == 300
     reader.close()
 
@@ -180,7 +180,7 @@ def test_a_journal_with_much_free_space_shrinks_in_steps(journal):
     pages = journal._number("PRAGMA page_count")
     assert journal.shrink() == 0
     journal.forget(20)
-    assert journal.shrink() == 0  # what is free is left for the rows to come
+    assert journal.shrink() == 0  # free space is kept for coming rows
     journal.forget(190)
     assert journal.shrink(most_pages=50) == 50
     while journal.shrink():
@@ -290,7 +290,7 @@ def send(journal: SqliteJournal, machine: str, first_seq: int, n: int = SAMPLES,
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a journal as kill -9 leaves it: 2000 acknowledged samples, and a decision in between."""
+    """A journal's folder after kill -9: 2000 acknowledged samples, a decision between them."""
     work, left = tmp_path_factory.mktemp("work"), tmp_path_factory.mktemp("left")
     with closing(open_journal(work)) as journal:
         for i in range(BATCHES):
@@ -325,7 +325,7 @@ def test_each_flip_in_the_log_is_named_and_counted_by_machine(killed, tmp_path):
         flip(folder / log, rng.randrange(size), rng.randrange(8))
         try:
             journal = open_journal(folder)
-        except StoreError as error:  # pages of different times are in the file
+        except StoreError as error:  # the file has pages of different times
             refusals.append(str(error))
             continue
         with closing(journal):
@@ -357,7 +357,7 @@ def test_a_mark_that_is_torn_or_behind_is_no_alarm(folder, kept):
 
 
 def cut_short(folder: Path, share: float = 0.5) -> None:
-    """The log loses its end, as by a flip in its middle."""
+    """Cut the log's end, as after a flip in its middle."""
     log = folder / "journal.db-wal"
     log.write_bytes(log.read_bytes()[: int(log.stat().st_size * share)])
 
@@ -427,7 +427,7 @@ def test_a_journal_that_is_not_there_any_more_is_named(folder):
 
 
 def test_a_watermark_behind_its_rows_ends_the_start(folder):
-    """As pages of different times would leave it: a batch that is sent again would be taken twice."""
+    """Pages of different times: a resent batch would be taken twice."""
     with closing(open_journal(folder)) as journal:
         journal.begin()
         journal.put_watermark("loader-1", 7, Watermark(900, 0, NOW_NS))

@@ -1,4 +1,4 @@
-"""A journal in PostgreSQL beyond the contract: what it refuses, how its lock is lost, what a restore leaves."""
+"""A journal in PostgreSQL beyond the contract: refusals, loss of the lock, restores."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def send(store: Store, first: int, count: int = 5, machine: str = "a") -> Ack | 
 
 
 def hang(store: Store) -> None:
-    """Have the holder of the lock say nothing any more, as a process does that is stopped."""
+    """Silence the holder of the lock, like a stopped process."""
     store.journal._session._ending.set()
 
 
@@ -152,7 +152,7 @@ def folded_by(store: Store) -> Grid:
 
 
 def test_a_holder_whose_network_swallows_all_bytes_notices_it(tmp_path, database):
-    """Something between acknowledges them, so that the kernel waits for ever."""
+    """A proxy acknowledges them, so the kernel waits for ever."""
     with Proxy(database.cluster.port) as proxy:
         url = database.url.replace(str(database.cluster.port), proxy.endpoint.rpartition(":")[2])
         store = Store(JournalLocation(tmp_path / "one", url), SITE, CONFIG, now_ns)
@@ -200,7 +200,7 @@ def test_a_holder_that_works_keeps_the_lock(tmp_path, database):
 
 
 def test_a_writer_without_its_lock_cannot_commit(tmp_path, database):
-    """The epoch alone fences it: its session stands. Not even what it had is acknowledged again."""
+    """Only the epoch fences it: its session lives. Even its own rows are not acknowledged again."""
     for had in (1, 2):
         with closing(open_store(tmp_path, database)) as store:
             if had == 1:
@@ -215,7 +215,7 @@ def test_a_writer_without_its_lock_cannot_commit(tmp_path, database):
 
 
 class LostAnswer:
-    """Cuts a session once, between a statement that has some text and its answer."""
+    """Cuts a session once, between a statement with some text and its answer."""
 
     def __init__(self, session: WriterSession, text: str) -> None:
         self._db, self._text = session._db, text
@@ -275,7 +275,7 @@ def test_a_server_goes_on_after_its_sessions_were_ended(tmp_path, database, end)
 
 
 def test_servers_that_start_at_once_on_an_empty_database_have_one_journal(tmp_path, database):
-    """Each knows its id before it asks who else serves the site: else the later one would take it for another."""
+    """Each knows its id before asking who else serves the site, else the later would take it for another."""
     places = [place(tmp_path / str(n), database) for n in range(8)]
     with ThreadPoolExecutor(len(places)) as threads:
         ids = list(threads.map(lambda one: one.prepared_id(SITE.name, SITE.frame), places))
@@ -293,7 +293,7 @@ def test_a_second_server_is_refused_where_it_may_not_wait(tmp_path, database):
 
 @pytest.fixture
 def restored(tmp_path: Path, database: Database) -> Iterator[Database]:
-    """A database that lacks two of three batches which server `one` acknowledged; `two` wrote others since."""
+    """A database without two of three batches acknowledged by server `one`; `two` wrote since."""
     with closing(open_store(tmp_path / "one", database)) as store:
         send(store, 1)
     cluster = database.cluster

@@ -1,4 +1,4 @@
-"""What operators do to a journal in PostgreSQL: dumps, base backups, restores."""
+"""Operators' work on a journal in PostgreSQL: dumps, base backups, restores."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from tests.postgres_server import Cluster, Database
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, random_samples, same, wait_for
 from tests.unit.mapserver.journal.test_postgres import folded_by, open_store, place, send
 
-MANY = 2000  # samples of a row, so that a dump is more than what a pipe holds
+MANY = 2000  # per row, so a dump exceeds a pipe
 
 
 def fill(store: Store, machine: str, rows: int) -> None:
-    """Rows that a dump needs a while for."""
+    """Rows for a slow dump."""
     batches = [incoming(random_samples(MANY, n), 1 + n * MANY, machine) for n in range(rows)]
     assert all(isinstance(answer, Ack) for answer in store.commit(batches))
 
 
 @contextmanager
 def dumping(database: Database) -> Iterator[subprocess.Popen[bytes]]:
-    """A real dump that does not get on, since nobody takes what it writes."""
+    """A real dump blocked by its full pipe."""
     words = [str(server.binaries() / "pg_dump"), "--format=plain", f"--dbname={database.url}"]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as dump:
         try:
@@ -40,7 +40,7 @@ def dumping(database: Database) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def restored_from(text: bytes, cluster: Cluster) -> Database:
-    """A new database with what a dump holds."""
+    """A new database from a dump."""
     database = cluster.new_database()
     words = [str(server.binaries() / "psql"), "--quiet", "--set=ON_ERROR_STOP=1", f"--dbname={database.url}"]
     done = subprocess.run(words, input=text, capture_output=True, check=False)
@@ -62,7 +62,7 @@ def test_a_real_dump_holds_neither_writer_nor_follower_up_and_is_a_backup(tmp_pa
         assert dump.returncode == 0
         assert reader.archived_row == 3
     copy = restored_from(text, database.cluster)
-    # A server with the folder of the old database knows what was acknowledged since; machines send it again.
+    # A server with the old database's folder knows later acknowledgements; machines resend.
     with closing(open_store(tmp_path, copy)) as store:
         assert "5 acknowledged samples of a are gone" in str(store.shortfalls[0])
         assert (store.journalled, store.journal.archived_row) == (before.row, 0), "as it was when the dump began"
@@ -93,7 +93,7 @@ def test_a_base_backup_of_a_live_primary_has_what_was_acknowledged_before_it_beg
                 ending.set()
                 working.join()
             assert sent > 0
-        (copy.data / "standby.signal").unlink()  # it is to be a primary
+        (copy.data / "standby.signal").unlink()  # becomes a primary
         copy.start()
         try:
             at = JournalLocation(tmp_path / "one", copy.url(database.name))

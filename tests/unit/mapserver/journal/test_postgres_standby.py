@@ -1,4 +1,4 @@
-"""Servers that wait for a journal in PostgreSQL, and what they take over."""
+"""Standby servers of a journal in PostgreSQL and their take-over."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def open_store(folder: Path, database: Database, standby: Standby | None = None,
 
 
 class StandsBy:
-    """A server that waits for the journal on a thread. store: once it has it; error: why it does not wait any more."""
+    """A server waiting on a thread. store: after take-over; error: reason of its end."""
 
     def __init__(self, folder: Path, database: Database) -> None:
         self.store: Store | None = None
@@ -103,7 +103,7 @@ def test_a_standby_whose_take_over_is_cut_waits_again(tmp_path, database, monkey
 
 
 def test_a_standby_of_a_database_that_is_made_anew_ends_and_leaves_it_empty(tmp_path, database):
-    """What it made there would be in the way of the backup that is put back."""
+    """Its tables would block the backup's restore."""
     cluster, name = database.cluster, database.name
     with closing(open_store(tmp_path / "one", database)) as store:
         send(store, 1)
@@ -116,7 +116,7 @@ def test_a_standby_of_a_database_that_is_made_anew_ends_and_leaves_it_empty(tmp_
         cluster.sql(f"CREATE DATABASE {name}")
         second.join()
         assert second.error or second.store, "it may have been faster than the database was gone"
-    for folder in ("one", "two"):  # as supervisors start them again
+    for folder in ("one", "two"):  # restarted by supervisors
         with pytest.raises(StoreError, match=r"holds no journal, and .* restore the database from a backup") as caught:
             place(tmp_path / folder, database).prepared_id(SITE.name, SITE.frame)
         assert "\n" not in str(caught.value)
@@ -149,7 +149,7 @@ def test_a_standby_whose_clock_is_a_year_behind_says_so_and_takes_nothing_until_
         assert (send(other, 6).watermark, other.journal.epoch) == (10, 3), "a year ahead, it takes over"
 
 
-@pytest.mark.nightly  # make test has the lock, the epoch and what a restore leaves
+@pytest.mark.nightly  # make test covers lock, epoch and restores
 def test_a_promoted_replica_has_all_that_was_acknowledged_and_the_old_primary_acknowledges_nothing(tmp_path):
     with synchronous_pair() as (primary, replica):
         promotes(tmp_path, primary, replica)
@@ -166,11 +166,11 @@ def promotes(tmp_path: Path, primary: Cluster, replica: Cluster) -> None:
         wait_for(lambda: follower.last_row == 3)
         assert follower.follow(follower.state(), 0.1).row == 3, "a replica has no notifications"
 
-    replica.promote()  # while the old primary lives, and a server writes to it
+    replica.promote()  # with the old primary alive and written to
     answers: list[Ack | Refused] = []
     writing = threading.Thread(target=lambda: answers.append(send(first, 16)), daemon=True)
     writing.start()
-    replica.sql("ALTER SYSTEM RESET synchronous_standby_names")  # it is alone now, which a person decides
+    replica.sql("ALTER SYSTEM RESET synchronous_standby_names")  # alone now, by a person's decision
     replica.sql("SELECT pg_reload_conf()")
     wait_for(lambda: replica.sql("SHOW synchronous_standby_names") == [("",)])
     second = Store(JournalLocation(tmp_path / "two", replica.url(database.name)), SITE, CONFIG, now_ns)
@@ -184,7 +184,7 @@ def promotes(tmp_path: Path, primary: Cluster, replica: Cluster) -> None:
     primary.stop()
     writing.join(20.0)
     assert [type(answer) for answer in answers] == [Refused]
-    first.journal._url = both  # as its operator gave it, where there are two
+    first.journal._url = both  # both hosts, as configured by an operator
     with pytest.raises((FencedError, UnwrittenError)):
         first.journal.begin()
     first.close()

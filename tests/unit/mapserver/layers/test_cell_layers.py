@@ -18,7 +18,7 @@ from protocol.errors import Refusal
 from protocol.site.ground_classes import SLOPE_LIMIT, ZONES
 from tests.unit.mapserver.data import NOW_NS, folded, refused, samples
 
-CELL = 8 * 16 + 8  # of the usual sample in its block
+CELL = 8 * 16 + 8  # the usual sample's, in its block
 LOG_STEP = np.log(100) / 23  # between resistance bins
 EXACT = {"cov_xx_m2": 0.0, "cov_yy_m2": 0.0}
 
@@ -29,7 +29,7 @@ def value(grid: Grid, layer: str, config: ReadConfig | None = None, now_ns: int 
 
 @pytest.mark.parametrize("c_rr", [*ev.RESISTANCE_CENTRES[::8], 0.004, 0.0137, 0.1, 0.4])
 def test_constant_resistance_reads_back(c_rr):
-    half_step = 0.5 / 256 * LOG_STEP  # a vote is split in 1/256 of a bin
+    half_step = 0.5 / 256 * LOG_STEP  # votes are split in 1/256 of a bin
     assert value(folded(samples(20, c_rr=c_rr)), "resistance") == pytest.approx(c_rr, rel=1.01 * half_step + 1e-6)
 
 
@@ -46,7 +46,7 @@ def test_constant_gradient_reads_back_exactly(east, north):
     [
         ("resistance", "c_rr", 0.04, 0.4, 1e-8),
         ("grade_east", "grade_e", 0.04, 0.4, 1e-8),
-        ("grade_east", "grade_e", 3.3 / 32, 4.9 / 32, 0.01),  # in the bin but one
+        ("grade_east", "grade_e", 3.3 / 32, 4.9 / 32, 0.01),  # in the last bin but one
     ],
 )
 def test_a_minority_does_not_move_the_value(layer, column, most, rest, off):
@@ -68,7 +68,7 @@ def test_class_is_that_of_the_zone_and_sure(index, zone):
 
 
 def deviation(c_rr: float, spread: float) -> float:
-    """Of c_rr, whose votes spread so much in their logarithm."""
+    """Std of c_rr for this spread of log votes."""
     return float(np.sqrt((SPREAD_SHARE * spread * c_rr) ** 2 + resistance_variance(c_rr)))
 
 
@@ -78,7 +78,7 @@ def grade_deviation(grade: float, spread: float) -> float:
 
 @pytest.mark.parametrize(("share", "likely"), [(0.7, 0.781), (0.9, 0.964), (1.0, 1.0)])
 def test_confidence_is_the_sharpened_share_of_the_leading_class(share, likely):
-    """0.7^1.5 / (0.7^1.5 + 0.3^1.5) is 0.781."""
+    """0.7^1.5 / (0.7^1.5 + 0.3^1.5) = 0.781"""
     leading = round(100 * share)
     grid = folded(samples(100, c_rr=[0.25] * leading + [0.008] * (100 - leading), distance_m=10.0))
     assert value(grid, "confidence") == pytest.approx(likely, abs=0.001)
@@ -218,7 +218,7 @@ def test_where_machines_could_measure_nothing_a_cell_is_driven_and_not_known():
     grid = folded(samples(5, **nothing))
     known = {name for name in LAYERS if np.isfinite(value(grid, name))}
     assert known == {"weight", "visits", "machines", "heading", "age_s"}
-    grid.fold(samples(1, distance_m=0.05, **EXACT), "a")  # a trace of a measurement in a cell that is driven much
+    grid.fold(samples(1, distance_m=0.05, **EXACT), "a")  # little measured distance in a much driven cell
     assert np.isnan(value(grid, "resistance"))
     assert np.isnan(value(grid, "grade_east"))
     assert value(grid, "resistance", ReadConfig(min_weight_m=0.02)) == pytest.approx(0.04, rel=0.01)

@@ -16,7 +16,7 @@ RESISTANCE_STD, GRADE_STD = 0.1, 0.01  # the first of log(c_rr)
 
 
 def window(c_rr=0.04, grade_e=0.0, grade_n=0.0, known=True, weight=4.0, std=RESISTANCE_STD):
-    """Layers of cells, NaN where not known."""
+    """Cell layers, NaN where unknown."""
     shape = (ROWS, COLUMNS)
     layers = {
         "resistance": np.broadcast_to(c_rr, shape),
@@ -31,7 +31,7 @@ def window(c_rr=0.04, grade_e=0.0, grade_n=0.0, known=True, weight=4.0, std=RESI
 
 
 def columns(*spans):
-    """Cells in these spans of columns."""
+    """Cells of these column spans."""
     mask = np.zeros((ROWS, COLUMNS), bool)
     for first, end in spans:
         mask[:, first:end] = True
@@ -100,7 +100,7 @@ def test_filled_class_follows_the_boundaries_of_the_read_options():
 def test_more_and_surer_evidence_has_the_say():
     west = columns((0, 10))
     sides = west | columns((11, COLUMNS))
-    c_rr = np.where(west, 0.25, 0.008)  # not the class that a tie goes to
+    c_rr = np.where(west, 0.25, 0.008)  # not the class that wins ties
     for better in (
         window(c_rr=c_rr, known=sides, weight=np.where(west, 9.0, 0.2)),
         window(c_rr=c_rr, known=sides, std=np.where(west, 0.1, 2.0)),

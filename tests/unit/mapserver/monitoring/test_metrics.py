@@ -1,4 +1,4 @@
-"""Metrics: what the server tells, in a text that the library's own parser reads."""
+"""The server's metrics, read by the library's parser."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ HEALTH = {
 
 
 def exposition(folder: Path, info: Mapping[str, Any] = INFO, **health: Mapping[str, Any]) -> str:
-    """The text for a server with this state; health by machine, with `_` for `-`."""
+    """Metrics text of a server in this state; health by machine, `_` for `-`."""
     received = {name.replace("_", "-"): ReceivedHealth(values, 1e9 + 0.25) for name, values in health.items()}
     registry = CollectorRegistry()
     registry.register(ServerCollector(lambda: info, lambda: received, lambda: CHANGES, folder, "1.2"))

@@ -1,4 +1,4 @@
-"""A store with samples of the past, without a server: journal, archive, checkpoints."""
+"""A store of past samples without a server: journal, archive, checkpoints."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,7 +22,7 @@ S = 10**9
 
 
 class PastStore:
-    """One machine's batch is one journal row; all rows are received an hour after the one before."""
+    """A batch per journal row, received an hour apart."""
 
     def __init__(self, folder: Path, cell_m: float = 1.0, config: FoldConfig = FOLD) -> None:
         self.folder = folder
@@ -40,14 +40,14 @@ class PastStore:
         list(archive(self.folder / FOLDER, self.reader, SITE, NOW_NS + rows * HOUR_NS, self.journal.forget))
 
     def make(self, closed_ns: int, without: Iterable[str] = ()) -> int:
-        """Make a checkpoint; returns how many steps it took."""
+        """Make a checkpoint; returns the number of steps."""
         return sum(1 for _ in make(self.past, self.reader, closed_ns, Facts(frozenset(without))))
 
     def as_of(self, to_ns: int, without: Iterable[str] = (), **more: object) -> Grid:
         return self.past.grid_as_of(self.reader, to_ns, facts=Facts(frozenset(without)), **more)
 
     def folded(self, to_ns: int, without: Iterable[str] = (), from_ns: int = 0) -> Grid:
-        """What the map is by its definition: a fold of the samples in memory, from the start."""
+        """The map by definition: a fold of the samples from the start."""
         grid = Grid(self.past.cell_m, self.past.config)
         for machine, rows in self.sent:
             if machine not in without:

@@ -1,4 +1,4 @@
-"""Checkpoints: which there should be, how they are made and kept in a file, and which can be used."""
+"""Checkpoints: schedule, making, files, validity."""
 
 import shutil
 import tempfile
@@ -172,7 +172,7 @@ def empty_store(tmp_path):
 
 
 def some_samples(seed: int, n: int = 40, first_h: float = 0.0, hours: float = HOURS):
-    """Samples of some hours, in any order; a few at full hours to the nanosecond."""
+    """Samples of some hours in any order, a few exactly at full hours."""
     rows = random_samples(n, seed, half_m=25.0)
     draw = np.random.default_rng(seed)
     stamps = NOW_NS + round(first_h * HOUR_NS) + draw.integers(0, max(1, round(hours * HOUR_NS)), n)
@@ -260,18 +260,18 @@ def at(days: float, hours: float = 0.0) -> int:
 @pytest.mark.parametrize(
     ("now", "usable", "stamps", "expected"),
     [
-        (at(0, 9.5), [], [at(0, 8.2)], at(0, 9)),  # the first full hour after the first sample
-        (at(0, 9), [], [at(0, 8.2)], None),  # an hour is over when its latest samples have come in
+        (at(0, 9.5), [], [at(0, 8.2)], at(0, 9)),  # first full hour after the first sample
+        (at(0, 9), [], [at(0, 8.2)], None),  # an hour ends when its latest samples are in
         (at(0, 9) + GRACE_NS, [], [at(0, 8.2)], at(0, 9)),
         (at(0, 9) + GRACE_NS - 1, [], [at(0, 8.2)], None),
-        (at(0, 12.5), [at(0, 9)], [at(0, 8.2), at(0, 11.1)], at(0, 12)),  # none for an hour without samples
-        (at(0, 12.5), [at(0, 9)], [at(0, 9)], at(0, 10)),  # a stamp at a full hour belongs to the next one
+        (at(0, 12.5), [at(0, 9)], [at(0, 8.2), at(0, 11.1)], at(0, 12)),  # none for an empty hour
+        (at(0, 12.5), [at(0, 9)], [at(0, 9)], at(0, 10)),  # a full hour's stamp belongs to the next
         (at(0, 12.5), [at(0, 9)], [at(0, 9) - 1], None),
-        (at(3, 12.5), [], [at(0, 8.2), at(1, 9)], at(1)),  # what is older than a day, by days
+        (at(3, 12.5), [], [at(0, 8.2), at(1, 9)], at(1)),  # older than a day: by days
         (at(3, 12.5), [at(1)], [at(0, 8.2), at(1, 9)], at(2)),
-        (at(3, 12.5), [at(0, 18)], [at(2, 13)], at(2, 14)),  # within the last day, by hours
+        (at(3, 12.5), [at(0, 18)], [at(2, 13)], at(2, 14)),  # within the last day: by hours
         (at(3, 12.5), [at(0, 18)], [at(2, 12.4)], at(2, 13)),
-        (at(3, 12.5), [at(0, 18)], [at(2, 11)], at(2, 12)),  # the hours after it are made as well
+        (at(3, 12.5), [at(0, 18)], [at(2, 11)], at(2, 12)),  # the following hours too
         (at(0, 9.5), [], [], None),
     ],
 )

@@ -1,4 +1,4 @@
-"""Maps of the past and histories of cells, and what is read for them."""
+"""Past maps, cell histories, and the rows they read."""
 
 from contextlib import closing
 
@@ -23,7 +23,7 @@ WINDOW = CellWindow(-7, 3, 20, 9)
 
 @pytest.fixture(params=[0, 3, 20], ids=lambda rows: f"{rows} archived")
 def store(request, tmp_path):
-    """Twenty rows of two machines within half an hour, some or all of them in the archive."""
+    """Twenty rows of two machines in half an hour, some or all archived."""
     with closing(PastStore(tmp_path)) as opened:
         parts = {name: np.split(random_samples(200, seed, half_m=25.0), 10) for seed, name in enumerate("ab")}
         for i in range(10):
@@ -72,7 +72,7 @@ def test_a_window_holds_the_same_evidence_as_the_whole(tmp_path, cell_m, closed_
 
 
 def two_hours(store: PastStore) -> None:
-    """A checkpoint between two hours of one row each, and a row of the first hour that came in late."""
+    """A checkpoint between two hours of a row each, and a late row of the first hour."""
     store.add(samples(10, stamp_ns=NOW_NS + np.arange(10) * S))
     store.add(samples(10, stamp_ns=NOW_NS + HOUR_NS + np.arange(10) * S, x_m=100.5))
     store.make(NOW_NS + HOUR_NS)
@@ -191,7 +191,7 @@ def test_cells_are_those_of_the_grid(tmp_path):
 
 @pytest.mark.parametrize("std_m", [0.0, 1.0, 2.9])
 def test_no_sample_is_passed_over_that_votes_for_the_cell(tmp_path, std_m):
-    """Samples around the cell, a tenth of a metre apart, each a span of its own."""
+    """Samples around the cell, 0.1 m apart, each its own span."""
     offsets = np.arange(-12.0, 12.0, 0.1)
     with closing(PastStore(tmp_path)) as store:
         stamps = NOW_NS + np.arange(len(offsets)) * S

@@ -1,4 +1,4 @@
-"""Snapshots: checkpoints that are closed now, so that a restart folds only the rows behind them."""
+"""Snapshots: checkpoints closed now, so a restart folds only later rows."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_with_any_snapshot_the_map_of_now_is_a_fold_from_the_start(tmp_path):
         for seed in range(3):
             store.add(random_samples(20, seed), "ab"[seed % 2])
         save(store, store.reader.last_row, store.folded(OPEN_END_NS))
-        store.add(random_samples(20, 7))  # stamped before and behind what the snapshot has
+        store.add(random_samples(20, 7))  # stamped before and after the snapshot's
         store.archive(2)
         assert same(store.as_of(OPEN_END_NS - 1), store.folded(OPEN_END_NS))
 
@@ -127,7 +127,7 @@ def test_a_snapshot_under_another_name_is_not_what_its_name_says(store):
     assert newest(store)[0] == 0
 
 
-# Pages that no grid has, behind a right checksum: reads of them would fail later, or the map have less in it.
+# Impossible pages under a right checksum: later reads would fail, or the map lack data.
 PARTS = ("header", "known", "table", "marks", "words", "counts", "high", "places", "runs")
 CHANGES = {
     **{f"header {c} {v}": ("header", (c,), v) for c in range(6) for v in (-1, 2**31 - 1)},

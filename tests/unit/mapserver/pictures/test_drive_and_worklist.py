@@ -1,4 +1,4 @@
-"""Pictures of a drive, with what lies along its line, and of a worklist."""
+"""Pictures of a drive along its line, and of a worklist."""
 
 from dataclasses import replace
 

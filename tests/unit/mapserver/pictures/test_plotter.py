@@ -17,7 +17,7 @@ def region(columns: int, rows: int, *, west: float = 0.0, south: float = 0.0, ce
 
 
 def cell_colour(image: np.ndarray, column: int, row: int, rows: int, cell_px: int) -> tuple[int, ...]:
-    """Colour in the middle of a cell; row 0 is the southernmost."""
+    """Colour at a cell's centre; row 0 is the southernmost."""
     x = frame.LEFT + column * cell_px + cell_px // 2
     y = frame.TOP + (rows - 1 - row) * cell_px + cell_px // 2
     return tuple(int(v) for v in image[y, x])
@@ -57,7 +57,7 @@ def test_every_size_fits_a_screen(columns, rows, cell):
     image = draw_resistance(here, [track] * 40, "A long title " * 20)
     assert image.dtype == np.uint8
     assert image.shape[1] <= 1600
-    assert (image[:, -4:] == 255).all()  # nothing is cut off at the right
+    assert (image[:, -4:] == 255).all()  # not cut at the right
     assert (image[-2:] == 255).all()  # nor below
 
 
@@ -65,7 +65,7 @@ def test_track_has_its_colour_and_a_marker_at_its_end():
     track = DrawnTrack("loader-1", np.array([10.5, 50.5, np.nan, 90.5]), np.array([10.5, 10.5, np.nan, 40.5]))
     image = draw_resistance(region(100, 50, resistance=0.04), [track])
     assert cell_colour(image, 90, 40, 50, 12) == plotter.TRACK_COLOURS[0]
-    assert min(cell_colour(image, 30, 10, 50, 12)) > 150  # a thin white line, smoothed
+    assert min(cell_colour(image, 30, 10, 50, 12)) > 150  # a thin white line, antialiased
     assert cell_colour(image, 70, 25, 50, 12) == plotter.GROUND_COLOURS[2]  # NaN breaks the line
 
 

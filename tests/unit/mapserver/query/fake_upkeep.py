@@ -1,4 +1,4 @@
-"""A upkeep with an answer to everything, and no thread; queries answered as the server does."""
+"""An Upkeep with all answers and no thread; queries answered like the server's."""
 
 from concurrent.futures import Future
 from dataclasses import asdict
@@ -16,7 +16,7 @@ from tests.unit.records import machine_state
 
 
 class FakeUpkeep:
-    """Stands for a Upkeep that knows the machines a and b; notes what it is asked."""
+    """An Upkeep of machines a and b that records its calls."""
 
     def __init__(self) -> None:
         self.asked: list[object] = []
@@ -40,7 +40,7 @@ def source_of(writer: Writer, upkeep: FakeUpkeep | None = None) -> ServerSource:
 
 
 class AnswersOf(Answers):
-    """Answers that say what they are of."""
+    """Answers that name their subject."""
 
     def __init__(self, writer: Writer, upkeep: FakeUpkeep | None = None) -> None:
         self.writer, self.source = writer, source_of(writer, upkeep)
@@ -52,7 +52,7 @@ def answers_of(writer: Writer, upkeep: FakeUpkeep | None = None) -> AnswersOf:
 
 
 def answered(answers: AnswersOf, name: str, parameters: dict[str, str]) -> bytes:
-    """Parse a query, wait for the row that it asks for, the newest unless it says which, and answer it."""
+    """Parse a query, wait for its row (default: the newest) and answer."""
     newest = answers.source.run(lambda state: state.version.row)
     if parameters.get("as_of") is None and name in ("segments", "worklist", "route", "way"):
         parameters = {"after": str(newest), **parameters}

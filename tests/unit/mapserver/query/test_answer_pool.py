@@ -10,7 +10,7 @@ from tests.unit.mapserver.data import wait_for
 
 
 class Held:
-    """Work that tells its name when it is done, and lasts until it is let go."""
+    """Work that reports its end and lasts until released."""
 
     def __init__(self) -> None:
         self.done: list[str] = []

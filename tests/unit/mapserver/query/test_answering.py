@@ -18,7 +18,7 @@ from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, open_writer, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 
-# One sample in each cell of two diagonals, the value tells the cell.
+# A sample per cell of two diagonals, with the value naming the cell.
 STEPS = np.arange(-40, 40)
 
 
@@ -140,10 +140,10 @@ def test_numbers_of_another_frame_are_refused_with_where_the_map_lies(answers, q
 def driven(
     cell_m: float, half: int, changed: tuple[int, int, int, int], step: int = 1, c_rr: float = 0.2
 ) -> list[np.ndarray]:
-    """Three passes an hour apart over a square of cells; a part (west, south, east, north) is repaved before the last.
+    """Three hourly passes over a square of cells, a part (west, south, east, north) repaved before the last.
 
-    half: half the square's edge; step: so many cells lie between two samples. Everything but step 1 leaves gaps. c_rr:
-    of the new ground; 0.04 is that of the old one, and only the gradient tells them apart.
+    half: half the edge; step: cells between samples, above 1 with gaps. c_rr: new ground; at the old one's 0.04 only
+    the gradient differs.
     """
     places = np.arange(-half, half, step) + 0.5
     x, y = (axis.ravel() for axis in np.meshgrid(places, places))
@@ -158,7 +158,7 @@ def driven(
 
 
 def map_of(folder, rows: list[np.ndarray], site=SITE, config=CONFIG) -> tuple[Writer, Answers]:
-    """The map of passes, which are folded past the door: there, a batch has so many samples at most."""
+    """Map of passes folded past the door, which limits batches."""
     writer = open_writer(folder, config, site)
 
     def fold(store: Store) -> None:
@@ -175,7 +175,7 @@ FILLED = ("resistance_filled", "resistance_class_filled", "resistance")
 
 
 def assert_parts_are_cut_from_the_whole(answers: Answers, cell_m: float, half: int, names, seed: int) -> np.ndarray:
-    """Compare random windows of the site with the same cells of one window of all of it."""
+    """Compare random windows with the same cells of one whole window."""
     whole = region(answers, *(np.array([-half, -half, half, half]) * cell_m), names=names)
     draw = np.random.default_rng(seed)
     for _ in range(15):
@@ -188,7 +188,7 @@ def assert_parts_are_cut_from_the_whole(answers: Answers, cell_m: float, half: i
     return whole
 
 
-# The repaved area lies across four blocks, and along the border of one.
+# The repaved area spans four blocks, then lies along a block's border.
 @pytest.mark.parametrize("changed", [(-8, -7, 6, 9), (-23, -5, -16, 1)])
 def test_a_change_across_blocks_is_answered_alike_in_every_window(tmp_path, changed):
     writer, answers = map_of(tmp_path, driven(1.0, 40, changed))
@@ -208,7 +208,7 @@ def test_a_change_across_blocks_is_answered_alike_in_every_window(tmp_path, chan
 
 @pytest.mark.parametrize(("cell_m", "c_rr", "edge_m"), [(1.0, 0.04, 11.0), (0.5, 0.2, 6.0)])
 def test_a_change_is_seen_with_all_its_surroundings_in_cells_of_any_size(tmp_path, cell_m, c_rr, edge_m):
-    cells = round(edge_m / cell_m)  # a metre more than the least
+    cells = round(edge_m / cell_m)  # a metre above the least
     rows = driven(cell_m, cells + 20, (-cells + 3, -4, 3, cells - 4), c_rr=c_rr)
     writer, answers = map_of(tmp_path, rows, replace(SITE, cell_m=cell_m))
     names = ("resistance", "grade_east", "changed_s")

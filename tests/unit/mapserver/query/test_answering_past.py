@@ -1,4 +1,4 @@
-"""Maps as of any time, their differences, the history of a point; machines, changes and commands."""
+"""Maps as of any time, differences, point histories; machines, changes, commands."""
 
 from contextlib import closing
 from unittest.mock import Mock
@@ -30,7 +30,7 @@ NAMES = (*LAYERS, "resistance_filled", "grade_filled_std")
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
-    """Function that starts a writer with the samples of each machine in two rows, in a folder of its own."""
+    """Start a writer with each machine's samples in two rows, in its own folder."""
     opened = []
 
     def start(rows=None, upkeep=None, excluded=()) -> Answers:
@@ -71,11 +71,11 @@ def test_the_map_as_of_now_is_the_map_to_the_bit(answers):
 
 @pytest.mark.parametrize(("after_s", "bounds"), [(900, (-3, 5, 12, 9)), (3600 + 900, (-40, -40, 40, 40))])
 def test_the_map_as_of_a_time_is_that_of_a_server_that_knew_no_more(answers, served, after_s, bounds):
-    stamp_ns = NOW_NS + after_s * S  # in the midst of journal rows
+    stamp_ns = NOW_NS + after_s * S  # amid journal rows
     then = answers.region(RegionQuery(Bounds(*bounds), NAMES, as_of_ns=stamp_ns))
     known = until(ROWS, stamp_ns)
     only = served(known).region(RegionQuery(Bounds(*bounds), NAMES))
-    # Ages count from the time that was asked for, not from the newest sample before it.
+    # ages count from the time asked for, not from the last sample before it
     assert equal(then, only, [name for name in NAMES if name not in ("age_s", "changed_s")])
     late_s = (stamp_ns - max(int(table["stamp_ns"].max()) for table in known.values())) / S
     np.testing.assert_allclose(then["age_s"], only["age_s"] + late_s, atol=0.01)
@@ -84,7 +84,7 @@ def test_the_map_as_of_a_time_is_that_of_a_server_that_knew_no_more(answers, ser
 
 
 def repaved():
-    """An area of 20 x 20 m, driven at 0.02, and two hours later at 0.25."""
+    """20 x 20 m driven at 0.02, two hours later at 0.25."""
     x, y = (axis.ravel() + 0.5 for axis in np.meshgrid(np.arange(20), np.arange(20)))
     place = {"x_m": x, "y_m": y, "distance_m": 4.0}
     old = samples(400, **place, c_rr=0.02, stamp_ns=NOW_NS + np.arange(400))
@@ -123,7 +123,7 @@ def test_a_difference_of_two_pasts_is_as_of_the_newer(served):
     names = ("resistance", "resistance_class")
     point = answers.point(PointQuery(10.0, 10.0, names, as_of_ns=late, minus_ns=early))
     assert point.values["resistance"] == pytest.approx(0.23, rel=0.05)
-    assert point.values["resistance_class"] == 3.0  # from class 1 to class 4: a number of classes
+    assert point.values["resistance_class"] == 3.0  # from class 1 to 4: number of classes
     assert point.stamp_ns == late
     back = answers.point(PointQuery(10.0, 10.0, names, as_of_ns=early, minus_ns=late))
     assert back.values["resistance_class"] == -3.0
@@ -137,7 +137,7 @@ def test_axes_have_no_difference(answers):
 
 
 def hours(*rates: float):
-    """A cell driven for two minutes at the beginning of every hour."""
+    """A cell driven for the first two minutes of each hour."""
     parts = [
         samples(12, c_rr=c_rr, stamp_ns=NOW_NS + i * HOUR_NS + np.arange(12) * 10 * S) for i, c_rr in enumerate(rates)
     ]
@@ -162,7 +162,7 @@ def test_a_history_is_bounded_by_its_times_and_cut_by_its_span(served):
     times = {"from_ns": NOW_NS + HOUR_NS, "to_ns": NOW_NS + 2 * HOUR_NS}
     got = answers.history(HistoryQuery(8.5, 8.5, ("weight",), **times))
     assert [span.first_ns for span in got.spans] == [NOW_NS + HOUR_NS, NOW_NS + 2 * HOUR_NS]
-    assert got.spans[0].values["weight"] > 5 * got.spans[1].values["weight"] > 0  # of that hour, the first sample
+    assert got.spans[0].values["weight"] > 5 * got.spans[1].values["weight"] > 0  # the first sample of that hour
     got = answers.history(HistoryQuery(8.5, 8.5, ("weight",), span_s=60.0))
     assert [(span.first_ns - NOW_NS) // S for span in got.spans] == [0, 60, 3600, 3660, 7200, 7260]
     [day] = answers.history(HistoryQuery(8.5, 8.5, span_s=86_400.0)).spans
@@ -181,7 +181,7 @@ def test_too_many_spans_are_refused_before_any_is_read(served, monkeypatch):
 
 def test_without_a_first_time_the_newest_spans_are_answered(served):
     answers = served(hours(0.02, 0.05, 0.25))
-    query = HistoryQuery(8.5, 8.5, ("weight",), span_s=1.0)  # 2000 s until now, which is 7310 s after the first sample
+    query = HistoryQuery(8.5, 8.5, ("weight",), span_s=1.0)  # 2000 s until now, 7310 s after the first sample
     spans = answers.history(query).spans
     assert {(span.first_ns - NOW_NS) // HOUR_NS for span in spans} == {2}
     before = answers.history(HistoryQuery(8.5, 8.5, ("weight",), to_ns=NOW_NS + HOUR_NS, span_s=2.0)).spans

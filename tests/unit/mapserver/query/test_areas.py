@@ -1,4 +1,4 @@
-"""Regions in an outline, of larger cells and in pieces, and many points."""
+"""Regions: outlines, larger cells, pieces; many points."""
 
 from contextlib import closing
 from itertools import pairwise
@@ -33,7 +33,7 @@ def answers(tmp_path_factory):
 
 
 def ask(answers, query):
-    """Through the bytes of question and answer, piece by piece."""
+    """Through the bytes of query and answer, by piece."""
     first = decode_region(answers.answer(parse_query(query.name, query.parameters())))
     if not first.piece:
         return first
@@ -42,7 +42,7 @@ def ask(answers, query):
 
 
 def winding(x, y, outline) -> bool:
-    """Whether an outline turns around a place."""
+    """Whether the outline winds around a place."""
     corners = np.array([*outline, outline[0]]) - (x, y)
     angles = np.unwrap(np.arctan2(corners[:, 1], corners[:, 0]))
     return bool(abs(angles[-1] - angles[0]) > np.pi)
@@ -197,7 +197,7 @@ def test_so_many_regions_are_read_at_once_and_one_that_is_read_makes_room(clock)
     assert caught.value.retry_after_s > 0
     _, grid = regions.reading(cursors[3], 0)
     regions.reading(cursors[3], grid.count - 1)
-    regions.reading(cursors[3], grid.count - 1)  # once more: it may have got lost
+    regions.reading(cursors[3], grid.count - 1)  # once more: it may have been lost
     regions.open(LARGE)
     with pytest.raises(QueryError):
         regions.reading(cursors[3], 0)

@@ -1,4 +1,4 @@
-"""Layers that are kept, and answers of them: what a server that begins now would derive, derived again where needed."""
+"""Kept layers and their answers equal those of a new server, derived again where needed."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ passing = st.tuples(st.just("passes"), st.integers(0, 9), st.sampled_from([0.02,
 
 
 def rows_of(what: str, seed: int, more: object, turn: int) -> Table:
-    """Samples around a place, or some passes of the road on ground of a resistance; each turn is later."""
+    """Samples around a place, or road passes on ground of a resistance; each turn is later."""
     if what == "passes":
         return passes(LINE, 3, more, seed=seed, after_s=400.0 * turn)  # type: ignore[arg-type]
     rows = random_samples(80, seed, half_m=8.0)

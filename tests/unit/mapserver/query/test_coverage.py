@@ -1,4 +1,4 @@
-"""Coverage is what the layers of the same cells say."""
+"""Coverage agrees with the layers of the same cells."""
 
 from contextlib import closing
 

@@ -1,4 +1,4 @@
-"""Lanes are what the fold has by heading; of those that nobody drives any more little is left."""
+"""Lanes equal the fold by heading; abandoned ones fade."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -26,7 +26,7 @@ BEGIN_NS = 1_750_000_000 * 10**9 // DAY_NS * DAY_NS
 
 
 def passes(x_m, count, begin_ns):
-    """Passes northwards along a line, one a minute."""
+    """Northward passes on a line, one a minute."""
     y_m = np.tile(np.arange(0.0, 64.0, 0.5), count)
     rows = empty(len(y_m))
     rows["stamp_ns"] = begin_ns + np.repeat(np.arange(count), 128) * 60 * 10**9 + np.tile(np.arange(128), count) * 10**8

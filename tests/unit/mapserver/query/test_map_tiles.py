@@ -20,7 +20,7 @@ def content(tiles: dict[tuple[int, int], MapTile]) -> dict[tuple[int, int], tupl
 
 
 class Page:
-    """A page that draws the map: it has the tiles that it was sent."""
+    """A page drawing the map from its received tiles."""
 
     def __init__(self, answers: Answers) -> None:
         self.answers = answers
@@ -181,7 +181,7 @@ def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
 
 
 def test_evidence_that_no_plane_shows_makes_another_tile_too(tmp_path):
-    """Who watches the map reads finer values where a tile is another one."""
+    """Watchers of the map read finer values where a tile has changed."""
     base = random_samples(3000, seed=0)
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(base)])

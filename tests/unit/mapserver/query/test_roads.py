@@ -1,4 +1,4 @@
-"""Roads and worklists as they are answered: now and as of any time, by what the map is made of."""
+"""Answers of roads and worklists, now and as of any time, for all the map's ingredients."""
 
 import threading
 from collections import Counter
@@ -36,7 +36,7 @@ FOREVER = 2**61
 
 
 def rows_of(first: float = 0.05, second: float = 0.03):
-    """Two machines, each on a road of its own; the second one an hour later."""
+    """Two machines on separate roads, the second an hour later."""
     return {"a": passes(LINE, 6, first), "b": passes(BESIDE, 6, second, seed=1, after_s=3600.0)}
 
 
@@ -48,7 +48,7 @@ def writer(tmp_path):
 
 
 def deliver(writer, parts):
-    """Samples by machine, part after part."""
+    """Samples by machine and part."""
     sent = Counter()
     for rows in parts:
         for name, own in rows.items():
@@ -131,7 +131,7 @@ def test_hours_and_bounds_choose(writer):
 
 
 def test_shuffled_and_rebatched_samples_give_the_same_list(tmp_path):
-    """Two machines on one road that was repaired, and on one of their own; whoever sends first, in whatever pieces."""
+    """Two machines on a shared, repaired road and on their own; any order of senders and pieces."""
     draw, parts, lists = np.random.default_rng(37), (of_both(4, 0.06, 0.0), of_both(3, 0.02, 900.0), rows_of()), []
     rows = {name: np.concatenate([part[name] for part in parts]) for name in "ab"}
     for shuffled in (False, True):
@@ -158,7 +158,7 @@ def test_facts_count_for_samples(writer):
     assert all(right[name] == raw[name] for name in raw if name.split("_")[1] != "0")
     writer.run(lambda store: setattr(store, "facts", Facts(frozenset({"a"}), number=2)))
     gone = [one for one in segments(answers).segments if one.id.split("_")[1] == "0"]
-    assert gone  # of this grid, which was not folded again here
+    assert gone  # of this grid, not folded again here
     assert all(sum(one.passes_ph) == 0 and one.resistance is None for one in gone)
 
 
@@ -229,7 +229,7 @@ BOX = Bounds(36.0, 8.0, 44.0, 13.0)
 
 @pytest.fixture
 def repaired(tmp_path):
-    """Ground of 0.06 until 600 s, 0.02 since, driven by two machines; and the stamp at which it was still bad."""
+    """Ground of 0.06 until 600 s, then 0.02, driven by two machines; a stamp before the repair."""
     with closing(open_writer(tmp_path)) as opened:
         deliver(opened, [of_both(4, 0.06, 0.0), of_both(3, 0.02, 900.0)])
         yield opened, START_NS + 800 * 10**9
@@ -243,10 +243,10 @@ def test_a_found_change_begins_a_new_age_of_its_cells(repaired):
     opened, then_ns = repaired
     answers = answers_of(opened)
     plain, since = (resistance(answers, repairs=repairs) for repairs in (False, True))
-    driven, again = np.isfinite(plain), np.isfinite(since)  # some only touched since: not known
+    driven, again = np.isfinite(plain), np.isfinite(since)  # some only touched since: unknown
     assert again.sum() > driven.sum() / 2
     assert not (again & ~driven).any()
-    assert plain[driven].max() > 0.03  # of old and new samples together: the strip is too narrow for a change of cells
+    assert plain[driven].max() > 0.03  # old and new samples mixed: too narrow a strip for a change of cells
     assert since[again] == pytest.approx(0.02, rel=0.2)
     np.testing.assert_array_equal(resistance(answers_of(opened), repairs=True), since)  # as after a restart
     before = resistance(answers, repairs=True, as_of_ns=then_ns)
@@ -321,11 +321,11 @@ def come(opened, machine="c"):
     send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine=machine)])
 
 
-DEAR = 1e9  # times what a making took: as if it had taken long
+DEAR = 1e9  # factor on making times
 
 
 class Clock:
-    """Steady seconds, as told; each look at it takes some."""
+    """Steady seconds, set by the test; each look takes some."""
 
     def __init__(self, look_s: float = 0.0) -> None:
         self.now_s, self._look_s = 100.0, look_s
@@ -355,13 +355,13 @@ WHOLE = RouteQuery(((15.0, 10.0), (205.0, 10.0)))
 
 
 def row_of(answers: Answers, query: RouteQuery) -> int:
-    """Which row of the journal a route is of."""
+    """The journal row of a route."""
     return decode_answer(answers.answer(query)).version.row
 
 
 @pytest.fixture
 def slow(repaired, monkeypatch):
-    """Answers to which newer roads are in the making beside, since somebody waits for them, until an event is set."""
+    """Answers whose newer, awaited roads are in the making until an event is set."""
     opened, _ = repaired
     answers, may_end, began = answers_of(opened), threading.Event(), threading.Event()
     assert row_of(answers, WHOLE) == 4
@@ -387,7 +387,7 @@ def test_roads_in_the_making_hold_up_nobody_and_who_waits_for_them_takes_them(sl
     assert row_of(answers, WHOLE) == row_of(answers, WHOLE) == 4
     assert row_of(answers, replace(WHOLE, repairs=False)) == 5
     with monkeypatch.context() as patched:
-        patched.setattr(road_maps, "FRESH_S", -1.0)  # too old at once
+        patched.setattr(road_maps, "FRESH_S", -1.0)  # stale at once
         assert answers.tiles(TilesQuery()).version.row == 5, "a picture goes without them"
     may_end.set()
     assert [one.result(PATIENCE_S) for one in waiting] == [5] * 4
@@ -453,7 +453,7 @@ def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
     ids=["calibration", "distrust"],
 )
 def test_a_fact_between_two_passes_is_no_repair(tmp_path, facts):
-    """The machines' samples are off by 0.02, or b's alone; the fact comes while they drive on."""
+    """Samples of the machines, or of b alone, are off by 0.02; the fact comes as they drive on."""
     off = {"a": 0.0 if facts.excluded else 0.02, "b": 0.02}
     parts = [of_both(4, 0.04, 0.0), of_both(4, 0.04, 600.0)]
     for name in "ab":
@@ -504,7 +504,7 @@ def test_traffic_of_one_machine_on_the_roads_of_all(writer):
 
 @pytest.mark.slow
 def test_burned_litres_stand_beside_predicted_ones_in_the_list_and_at_changes(tmp_path):
-    """All of one price: a section that burns as its resistance says is predicted right; one without fuel has none."""
+    """Equal prices: sections burning by their resistance are predicted right; those without fuel have none."""
     worse = np.concatenate([of_both(8, 0.02, 0.0)["a"], of_both(6, 0.06, 1800.0)["a"]])
     worse["fuel_l"] = 0.5 * 40_000 * 9.80665 * worse["c_rr"] / (0.4 * 35.8e6)
     with closing(open_writer(tmp_path)) as opened:

@@ -1,4 +1,4 @@
-"""Routes and ways over maps that samples made: costs, lines, machines that are named, and what is refused."""
+"""Routes and ways over maps from samples: costs, lines, named machines, refusals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROLLING = (False, False)
 
 
 def ground(resistance, grade_e=lambda x, y: 0 * x, skipped=lambda x, y: x != x):
-    """A sample in each cell, with the resistance and the slope there."""
+    """A sample per cell with its resistance and slope."""
     x, y = (axis.reshape(-1) + 0.5 for axis in np.meshgrid(np.arange(-HALF, HALF), np.arange(-HALF, HALF)))
     here = ~skipped(x, y)
     x, y = x[here], y[here]
@@ -45,14 +45,14 @@ def answers_on(folder: Path, rows: Table) -> Iterator[Answers]:
 
 
 def ask(answers: Answers, query: RouteQuery | WayQuery) -> RouteAnswer:
-    """Through the bytes of question and answer."""
+    """Through the bytes of query and answer."""
     again = parse_query(query.name, query.parameters())
     assert again == query
     return decode_answer(answers.answer(again))
 
 
 def test_two_soils_cost_what_each_does_over_its_length(tmp_path):
-    """Half of it gravel and half wet dirt, on a plane that rises: the sum of both, and brakes take nothing."""
+    """Half gravel, half wet dirt on a rising plane: the sum of both, none lost to brakes."""
     soils = lambda x, y: np.where(x < 0, 0.02, 0.06)  # noqa: E731
     with answers_on(tmp_path, ground(soils, lambda x, y: 0.015 + 0 * x)) as answers:
         there, back = (
@@ -101,7 +101,7 @@ def test_unknown_ground_is_dear_refused_or_as_told(tmp_path):
 
 
 def test_a_way_keeps_to_a_road_of_fifteen_degrees(tmp_path):
-    """Unknown ground beside it is no way up for nothing, though most of what is known is even."""
+    """Unknown ground beside it is no free climb, though most known ground is even."""
     up = lambda x, y: np.where(abs(x) < 10, 0.27, 0.0)  # noqa: E731
     beside = lambda x, y: (abs(y) > 2) & (abs(x) < 45)  # noqa: E731
     with answers_on(tmp_path, ground(lambda x, y: 0.03 + 0 * x, up, beside)) as answers:
@@ -140,7 +140,7 @@ def test_unknown_ground_costs_the_same_whoever_asks_from_wherever(tmp_path):
 
 
 def test_no_drive_over_the_way_is_dearer_than_straight_on(tmp_path):
-    """Cells know of no stops and curves: a way around that saves less than they cost is none."""
+    """Cells ignore stops and curves: a detour saving less than those cost is none."""
     rough = lambda x, y: (abs(x) < 8) & (y > -4)  # noqa: E731
     for share in (1.02, 1.3):
         rows = ground(lambda x, y, over=share: np.where(rough(x, y), 0.03 * over, 0.03))
@@ -224,7 +224,7 @@ def drive(stamp_ns: int, mass_kg: float, speed_mps: float = 5.0, n: int = 20):
 
 @pytest.fixture
 def answers(tmp_path):
-    """A truck that is loaded after half an hour, one without a scale, and a loader that sent two hours ago."""
+    """A truck loaded after half an hour, one without a scale, and a loader last heard two hours ago."""
     with closing(open_writer(tmp_path)) as writer:
         half_hour, hours = 1800 * S, 7200 * S
         batches = [

@@ -1,4 +1,4 @@
-"""Samples of machines on given lines, and the roads that a map of them shows."""
+"""Samples on given lines, and the roads of their map."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def along(corners: Iterable[tuple[float, float]]) -> Floats:
 
 
 def ring(centre: tuple[float, float], radius_m: float) -> Floats:
-    """One lap of a circle, counter-clockwise."""
+    """One lap, counter-clockwise."""
     turns = np.arange(0.0, 2 * np.pi, STEP_M / radius_m)
     return np.array(centre) + radius_m * np.stack([np.cos(turns), np.sin(turns)], axis=1)
 
@@ -38,7 +38,7 @@ def ring(centre: tuple[float, float], radius_m: float) -> Floats:
 def passes(
     line: Floats, count: int = 6, c_rr: float = 0.02, seed: int = 0, after_s: float = 0.0, mass_kg: float = 40_000.0
 ) -> Table:
-    """Samples of so many passes along a line, each a little beside it."""
+    """Passes along a line, each slightly offset."""
     draw = np.random.default_rng(seed)
     parts = []
     ahead = np.gradient(line, axis=0)
@@ -58,7 +58,7 @@ def passes(
 
 
 def grid_of(*machines: Table) -> Grid:
-    """The evidence of machines."""
+    """The machines' evidence."""
     grid = Grid(1.0, FoldConfig())
     for i, rows in enumerate(machines):
         grid.fold(rows, f"truck-{i}")
@@ -66,12 +66,12 @@ def grid_of(*machines: Table) -> Grid:
 
 
 def roads_of(grid: Grid, skeletons: Skeletons | None = None) -> SegmentTable:
-    """The roads that a map shows."""
+    """The map's roads."""
     blocks = grid.blocks_in(EVERYWHERE)
     pages = dict(zip(blocks, grid.pages(blocks), strict=True))
     return segments(network((skeletons or Skeletons(1.0)).skeleton(pages)))
 
 
 def roads(*machines: Table) -> SegmentTable:
-    """The roads that samples show."""
+    """Roads from samples."""
     return roads_of(grid_of(*machines))

@@ -1,4 +1,4 @@
-"""Litres burned on segments beside those that resistance, slope, mass and speed predict."""
+"""Burned litres on segments against those predicted by resistance, slope, mass and speed."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from protocol.arrays import Table
 from protocol.units import DIESEL_J_PER_L, GRAVITY_MPS2
 from tests.unit.mapserver.roads.drives import STEP_M, along, passes, roads
 
-PER_J, PER_H = 1 / (0.4 * DIESEL_J_PER_L), 6.0  # litres for work at the margin and for an hour
+PER_J, PER_H = 1 / (0.4 * DIESEL_J_PER_L), 6.0  # litres per marginal work and per hour
 LINE = along([(10, 20), (310, 20)])
 
 
 def driven(*, slope: float = 0.0, back: bool = False, accel_mps2: float = 0.0, fuel: bool = True) -> Table:
-    """Passes over good ground, then bad from the middle on; burning as Willans' line has it."""
+    """Passes over good, then bad ground; fuel by Willans' line."""
     rows = passes(LINE[::-1] if back else LINE, 6, 0.02)
     rows["c_rr"] = np.where(rows["x_m"] < 160, 0.02, 0.06)
     rows["grade_e"], rows["grade_n"], rows["grade_var"] = np.where(rows["x_m"] < 160, slope, 0.0), 0.0, 1e-4
@@ -44,7 +44,7 @@ def litres(*machines: Table) -> Litres | None:
 @pytest.mark.parametrize("slope", [0.0, 0.03, -0.05])
 @pytest.mark.parametrize("accel_mps2", [0.0, 0.05])
 def test_what_follows_resistance_slope_and_speed_is_predicted_as_burned(slope: float, accel_mps2: float) -> None:
-    """Downhill too, where engines burn nothing, on segments that burn three times as much as others."""
+    """Downhill too, with engines burning nothing, on segments of three times the burn."""
     machines = driven(slope=slope, accel_mps2=accel_mps2), driven(slope=slope, back=True)
     fuel = litres(*machines)
     assert fuel
@@ -59,7 +59,7 @@ def test_what_follows_resistance_slope_and_speed_is_predicted_as_burned(slope: f
 
 
 def test_ground_that_the_map_has_wrong_stands_out() -> None:
-    """A segment that burns a half more than its resistance says is off by that, and the others hardly."""
+    """A segment burning a half more than its resistance is off by that, others hardly."""
     rows = driven()
     odd = (rows["x_m"] > 200) & (rows["x_m"] < 225)
     rows["fuel_l"][odd] *= 1.5

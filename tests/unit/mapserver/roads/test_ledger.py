@@ -1,4 +1,4 @@
-"""The ledger of segments: exact sums, by hour and direction, whatever the order; trends and losses of known ground."""
+"""The segment ledger: exact sums by hour and direction in any order; trends and losses of known ground."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Passes over segments, and what is taken for a repair: two passes that agree."""
+"""Passes over segments, and detected repairs: two agreeing passes."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def tally_of(machines):
 
 
 def fleet(values, machines=("a", "b"), noise=0.0):
-    """Passes of machines in turn, 150 s apart, each over ground of another resistance."""
+    """Machines' passes in turn, 150 s apart, each with its resistance."""
     draw = np.random.default_rng(4)
     parts = {name: [] for name in machines}
     for i, c_rr in enumerate(values):
@@ -48,14 +48,14 @@ def test_a_pass_is_what_a_machine_drove_on_a_segment_within_a_minute():
 
 
 WORSE, SIX = [0.02] * 6 + [0.05] * 3, [0.04] * 6
-HARD = [0.016] * 8 + [0.0102] * 4  # where what is left of a machine's zero is a large share
-BEFORE_BOTH, AFTER_BOTH = [0.036, 0.049], [0.024, 0.033]  # one machine finds a third more than the other
+HARD = [0.016] * 8 + [0.0102] * 4  # the residual zero of a machine is a large share here
+BEFORE_BOTH, AFTER_BOTH = [0.036, 0.049], [0.024, 0.033]  # one machine measures a third more
 
 
 @pytest.mark.parametrize(
     ("values", "machines", "minutes"),
     [
-        ([*SIX, *[0.02] * 4], "ab", (2, 3)),  # the next pass is 150 s later
+        ([*SIX, *[0.02] * 4], "ab", (2, 3)),  # next pass after 150 s
         (WORSE, "ab", (2, 3)),
         (HARD, "ab", (4, 6)),  # three passes show it
         ([*BEFORE_BOTH * 3, *AFTER_BOTH * 2], "ab", (2, 3)),
@@ -97,7 +97,7 @@ def test_a_second_change_is_compared_with_what_came_after_the_first():
 
 
 def test_ground_that_wears_is_compared_with_the_newest_passes():
-    """Half a percent more from pass to pass is no change; over all passes it would hide the repair in the end."""
+    """Wear of 0.5 % per pass is no change; averaged over all passes it would finally hide the repair."""
     worn = [0.02 * 1.005**i for i in range(2 * TUNING.most_known)]
     repaired, looks = shown(fleet([*worn, 0.014, 0.014], noise=0.0))
     assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
@@ -106,7 +106,7 @@ def test_ground_that_wears_is_compared_with_the_newest_passes():
 
 
 def cells_of(blocks):
-    """Columns and rows of all cells with an age, and the ages."""
+    """Column and row of all cells with an age, and the ages."""
     places, begins = [], []
     for (x, y), own in blocks.items():
         at = np.flatnonzero(own)

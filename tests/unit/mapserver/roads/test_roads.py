@@ -1,4 +1,4 @@
-"""Roads of known lines: what is found, where it is cut, and that nothing but samples and facts decides it."""
+"""Roads of known lines: detection and cuts, determined only by samples and facts."""
 
 from collections import Counter
 from itertools import pairwise
@@ -14,21 +14,21 @@ from mapserver.roads.skeleton import Skeletons
 from protocol.arrays import Floats
 from tests.unit.mapserver.roads.drives import along, grid_of, passes, ring, roads, roads_of
 
-END_M = 3.5  # a road ends within so much of where machines turned round
+END_M = 3.5  # roads end this near to the turning points
 
 
 def off_m(line: Floats, shown: SegmentTable) -> float:
-    """How far points of a line are from the roads at most."""
+    """Largest distance from the line's points to the roads."""
     return float(max(np.hypot(*(shown.points - place).T).min() for place in line))
 
 
 def beyond_m(line: Floats, shown: SegmentTable) -> float:
-    """How far the roads are from a line at most."""
+    """Largest distance from the roads to the line."""
     return float(max(np.hypot(*(line - place).T).min() for place in shown.points))
 
 
 def degrees(shown: SegmentTable) -> Counter[int]:
-    """How many nodes there are of each degree."""
+    """Number of nodes by degree."""
     return Counter(Counter(shown.nodes[shown.nodes >= 0].tolist()).values())
 
 
@@ -46,7 +46,7 @@ def test_a_straight_road_is_cut_at_the_lattice():
     assert off_m(line, shown) < 2.0
     assert beyond_m(line, shown) < END_M
     cuts = np.array([shown.line(i)[0, 0] for i in range(1, 9)])
-    np.testing.assert_allclose(cuts % LATTICE_M, 0.5)  # the first cell of the next one
+    np.testing.assert_allclose(cuts % LATTICE_M, 0.5)  # first cell of the next
     assert (shown.length_m >= SLIVER_M).all()
     np.testing.assert_allclose(shown.ahead, [(1.0, 0.0)] * 9, atol=0.05)
 
@@ -59,13 +59,13 @@ def test_a_one_way_ring_is_closed():
     assert not degrees(shown)
     assert shown.length_m.sum() == pytest.approx(2 * np.pi * 40, rel=0.02)
     ends = Counter(tuple(point) for i in range(len(shown.ids)) for point in shown.line(i)[[0, -1]].tolist())
-    assert set(ends.values()) == {2}  # each segment goes on in another one
+    assert set(ends.values()) == {2}  # each segment continues in another
 
 
 @pytest.mark.parametrize(
     ("lines", "counts", "expected"),
     [
-        ([[(20, 50), (180, 50)], [(100, 0), (100, 100)]], (60, 2), {1: 4, 4: 1}),  # one that is seldom driven
+        ([[(20, 50), (180, 50)], [(100, 0), (100, 100)]], (60, 2), {1: 4, 4: 1}),  # a rarely driven one
         ([[(20, 50), (80, 50)], [(80, 50), (50, 50), (50, 20)], [(50, 20), (50, 80)]], (6, 6, 6), {1: 4, 4: 1}),
         ([[(20, 50), (100, 50), (180, 80)], [(20, 50), (100, 50), (180, 20)]], (6, 6), {1: 3, 3: 1}),
     ],
@@ -89,7 +89,7 @@ def test_lanes_six_metres_apart_stay_apart(weak, turn):
 
 
 def test_names_do_not_depend_on_what_was_made_before():
-    """Tile by tile, as evidence comes: what was kept of an earlier map shows nowhere."""
+    """Tile by tile as evidence comes: earlier maps leave no trace."""
     skeletons, grid = Skeletons(1.0), Grid(1.0, FoldConfig())
     parts = [
         passes(along(line), seed=i)
@@ -132,7 +132,7 @@ def test_halves_of_the_samples_have_the_same_names():
 
 @pytest.mark.parametrize("rounds", [1, 8])
 def test_a_yard_driven_all_over_gives_roads_that_are_whole(monkeypatch, rounds):
-    """However early pruning ends: lines are of cells that are there."""
+    """However early pruning ends: lines follow existing cells."""
     monkeypatch.setattr("mapserver.roads.network.ROUNDS", rounds)
     draw = np.random.default_rng(9)
     shown = roads(*(passes(along(draw.uniform(0, 80, (12, 2))), 1, seed=seed) for seed in range(4)))
@@ -150,7 +150,7 @@ def edges(*lines):
 
 
 def walk(seed, count=120):
-    """A line of cells' middles that turns slowly."""
+    """A slowly turning line of cell centres."""
     draw = np.random.default_rng(seed)
     heading = np.cumsum(draw.normal(0, 0.1, count)) + draw.uniform(0, 6)
     return 0.5 + np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)

@@ -1,4 +1,4 @@
-"""Drives with known answers: energy is resistance, height and speed; power, curves and brakes bound the speed."""
+"""Drives with known answers: energy of resistance, height, speed; speed limits of power, curves, brakes."""
 
 import math
 
@@ -18,7 +18,7 @@ N = 1000
 def rolling(
     resistance: float | Floats, slope: float | Floats, machine: RouteMachine = MACHINE, ends: float = 2.0
 ) -> Drive:
-    """A drive of N steps of 1 m that begins and ends at a speed."""
+    """N steps of 1 m with equal speed at both ends."""
     limit = np.full(N + 1, np.inf)
     limit[[0, -1]] = ends
     return drive(np.ones(N), np.zeros(N) + resistance, np.zeros(N) + slope, limit, machine)
@@ -44,7 +44,7 @@ def test_a_machine_starts_and_stops_within_its_limits() -> None:
     assert change.max() <= MACHINE.accelerate_mps2 + 1e-9
     assert change.min() >= -MACHINE.brake_mps2 - 1e-9
     assert done.speed_mps.max() == MACHINE.speed_mps
-    # the way of even acceleration, as in a textbook
+    # distance of constant acceleration
     start = int(np.argmax(done.speed_mps >= 4.0))
     assert start == pytest.approx(4.0**2 / 2 / MACHINE.accelerate_mps2, abs=1.0)
     assert done.time_s[:start].sum() == pytest.approx(4.0 / MACHINE.accelerate_mps2, rel=0.05)
@@ -61,7 +61,7 @@ def test_what_the_power_cannot_do_is_said() -> None:
 
 
 def test_changes_of_the_ground_cost_what_drivers_answer_late() -> None:
-    """By the size of the change, there and back alike; where brakes hold all the time, nothing."""
+    """By the size of the change, both ways; none where brakes hold throughout."""
     n = 200
     step, limit = np.ones(n), np.full(n + 1, np.inf)
     plain = RouteMachine(mass_kg=20_000.0, speed_mps=5.0, power_w=1e6)

@@ -1,4 +1,4 @@
-"""Cheapest lines: against known answers, and against a search with 64 neighbours."""
+"""Least-cost lines against known answers and a search with 64 neighbours."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,7 @@ def even(size: int = 100, resistance: float = 0.02, crawl: float = math.inf) -> 
 
 
 def rough(seed: int, size: int = 120) -> CostField:
-    """Hills, and patches of sand and of paved ground."""
+    """Hills with patches of sand and paved ground."""
     rng = np.random.default_rng(seed)
     height = gaussian_filter(rng.standard_normal((size, size)), 20)
     north, east = np.gradient(6 * height / height.std())
@@ -43,7 +43,7 @@ def test_on_even_ground_the_line_is_straight(end: tuple[int, int]) -> None:
 
 
 def test_no_line_is_dearer_than_with_64_neighbours() -> None:
-    """On maps that nobody chose; at most 2 % on the worst, 1 % in the median."""
+    """Random maps: at most 2 % at worst, 1 % median."""
     ratios = []
     for seed in range(6):
         terrain = rough(seed)
@@ -60,7 +60,7 @@ def test_no_line_is_dearer_than_with_64_neighbours() -> None:
 
 
 def test_downhill_costs_something_everywhere() -> None:
-    """Else distances would be wrong in silence: a settled cell would have to be settled again."""
+    """Else settled cells would need settling again, and distances be silently wrong."""
     terrain = replace(even(), grade_east=np.full((100, 100), -0.3))
     line, cost = line_of(terrain, (50, 10), (50, 90))
     assert cost == pytest.approx(LEAST_COST * 80)

@@ -1,4 +1,4 @@
-"""Routes over ground whose cost is known, and prices of ground where nobody was."""
+"""Routes over ground of known cost, and prices of unvisited ground."""
 
 import math
 
@@ -14,7 +14,7 @@ from protocol.queries.routing import RouteMachine
 from protocol.units import GRAVITY_MPS2
 
 SIZE = 220
-SLOW = RouteMachine(mass_kg=20_000.0, speed_mps=2.0)  # so slow that it rolls out without its brakes
+SLOW = RouteMachine(mass_kg=20_000.0, speed_mps=2.0)  # slow enough to roll out without brakes
 WEIGHT_N = 20_000 * GRAVITY_MPS2
 ROLLING = (False, False)
 
@@ -51,7 +51,7 @@ def test_the_interval_holds_the_cost_and_grows_with_what_is_not_sure() -> None:
 
 
 def test_a_slope_that_is_wrong_is_a_resistance_that_is_wrong_the_other_way() -> None:
-    """Where both were measured; a slope of neighbours has nothing to do with the resistance of neighbours."""
+    """Where both were measured; neighbours' slopes are unrelated to neighbours' resistance."""
     ahead, width = line((10, 10), (170, 130)), {}
     for name, visits, slope_std in (("sure", 4.0, 0.0), ("measured", 4.0, 0.02), ("filled", np.nan, 0.02)):
         ground = fields(0.03)
@@ -64,14 +64,14 @@ def test_a_slope_that_is_wrong_is_a_resistance_that_is_wrong_the_other_way() -> 
 
 
 def test_no_line_is_so_long_that_errors_of_a_map_vanish() -> None:
-    """What scales and drives err in is common to all of it."""
+    """Errors of scale and of drives are common to all of it."""
     _, totals = route(line((1, 1), (219, 219), (1, 219), (219, 1)), fields(0.1, std=1e-6), SLOW, stops=ROLLING)
     half = (totals.energy_high_j - totals.energy_low_j) / 2 / totals.energy_j
     assert half == pytest.approx(1.645 * math.hypot(0.03, 0.02), rel=0.1)
 
 
 def test_what_was_driven_on_and_not_measured_lies_between_what_was() -> None:
-    """Half as sure as its ends differ; its slope is known."""
+    """Uncertain by half its ends' difference; its slope is known."""
     soils = np.where(np.arange(SIZE) < 100, 0.01, 0.09) + np.zeros((SIZE, 1))
     soils[:, 80:121] = np.nan
     layers = fields(soils, east=0.01)
@@ -109,7 +109,7 @@ HERE = {(0, 0)}
 
 
 def squares(made: dict[tuple[int, int], dict[str, object]], std: float = 0.001) -> Squares:
-    """Of resistance, grade (east) and where machines were; NaN where nothing is said."""
+    """Resistance, grade (east) and visited squares; NaN: unknown."""
     out = {}
     for place, values in made.items():
         layers = {name: np.full((EDGE, EDGE), np.nan) for name in NEEDS}

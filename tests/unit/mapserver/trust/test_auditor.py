@@ -1,4 +1,4 @@
-"""Simulated fleets on five zones: bad machines are found, with the reason; nobody else is."""
+"""Simulated fleets on five zones: bad machines are found with reason, no others."""
 
 import tracemalloc
 from typing import Any
@@ -45,7 +45,7 @@ def drive(
     site: np.ndarray = SITE,
     later: tuple[float, np.ndarray] | None = None,
 ) -> Table:
-    """One machine that drives from goal to goal; later: from this time on [s] the site is another one."""
+    """A machine driving from goal to goal; later: time of the site's change [s]."""
     rng = np.random.default_rng(seed)
     n = round(km * 1000 / STEP_M)
     goals = rng.uniform(0, (WIDTH_M, HEIGHT_M), (n // 20, 2))
@@ -171,7 +171,7 @@ def test_no_machine_is_accused_without_need(case: str) -> None:
 
 @pytest.mark.parametrize("after_s", [0.0, 3600.0])
 def test_a_machine_that_left_before_the_rain_is_not_accused(after_s: float) -> None:
-    """Unless it was there at the same time."""
+    """Unless it was there then."""
     auditor = Auditor(1.0)
     send(auditor, "d", [drive(1)])
     send(auditor, "abc", fleet(0, GOOD, GOOD, GOOD, site=WETTER, start_s=after_s))
@@ -212,7 +212,7 @@ def test_many_rows_at_once_are_judged_as_one_by_one() -> None:
 
 
 def test_ten_machines_on_a_large_site_take_little_memory() -> None:
-    """1 km2, 10 % of it driven by each of ten machines: 25 000 cells of 2 m."""
+    """1 km2, a tenth driven by each of ten machines: 25 000 cells of 2 m."""
     x_m, y_m = np.meshgrid(np.arange(0.5, 1000, 2), np.arange(0.5, 100, 2))
     rows = samples(x_m.size, x_m=x_m.ravel(), y_m=y_m.ravel(), stamp_ns=NOW_NS)
     tracemalloc.start()

@@ -1,4 +1,4 @@
-"""Judgements: each limit from both sides, votes, clocks; decisions that come of them."""
+"""Judgements: limits from both sides, votes, clocks; resulting decisions."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -144,7 +144,7 @@ def test_the_larger_side_that_agrees_in_itself_outvotes(matrix: Ints, expected: 
 
 
 def judged(sent: Iterator[tuple[str, float]]) -> int:
-    """State of machine x against o after these (machine, newest stamp [s]) in order of arrival."""
+    """State of x against o after (machine, newest stamp [s]) in order of arrival."""
     clocks = ClockLeads()
     for machine, stamp_s in sent:
         clocks.add(machine, round(stamp_s * 1e9))
@@ -154,7 +154,7 @@ def judged(sent: Iterator[tuple[str, float]]) -> int:
 def both(
     pace: float = 1.0, late_s: float = 0.0, jitter_s: float = 0.0, others_stop_s: float = 1e9
 ) -> Iterator[tuple[str, float]]:
-    """Every 10 s of the others' time each sends once; x is late and sends at its own pace, as it can."""
+    """Both send every 10 s of the others' time; x late and at its own pace."""
     rng = np.random.default_rng(0)
     for now in range(10_000, 13_000, 10):
         yield "o", min(now, others_stop_s)
@@ -210,7 +210,7 @@ GOOD = Verdict("c", (), {"gain": 1.0}, False, frozenset({Reason.GAIN, Reason.OFF
 
 
 def decided(decisions: TrustDecisions, verdict: Verdict, times: int) -> list[TrustDecision]:
-    """What the audit decides on the same verdict again and again; each decision counts at once."""
+    """Audit decisions on a repeated verdict, each effective at once."""
     made = []
     for stamp_ns in range(1, times + 1):
         for decision in decisions.judge({verdict.machine: verdict}, stamp_ns):

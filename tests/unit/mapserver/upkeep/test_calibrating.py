@@ -1,4 +1,4 @@
-"""Ledgers that follow the samples, solves in site time, and what people ask of them."""
+"""Ledgers following the samples, solves in site time, people's requests."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def solved(writer: Writer, *doubtful: str) -> Solution:
 
 
 def of_ledgers(job: Calibrating) -> Solution:
-    """What the ledgers come to. Since when there may be samples is more or less known, and no matter of theirs."""
+    """The ledgers' result, without the first times of samples, which they do not own."""
     return replace(job.solve()[0], begins_ns={})
 
 
@@ -119,7 +119,7 @@ def test_it_solves_in_site_time(tmp_path):
             assert [round((now_ns - START_NS) / S) for now_ns in decided] == [75, 140], (
                 "10 s were there before it began"
             )
-            job._due_s = 1e12  # it has used more than its share of the processor
+            job._due_s = 1e12  # beyond its share of the processor
             send(writer, [incoming(rows[seq - 1 :], seq, "a")])
             job.run()
             assert len(decided) == 2
@@ -285,7 +285,7 @@ def test_one_clock_that_was_ahead_does_not_stop_the_calibration_of_the_site(tmp_
 
 
 def test_what_a_clock_stamped_that_was_ahead_has_no_part_in_a_solve(tmp_path, monkeypatch):
-    """A machine drives with a clock that is 20 h ahead, and then with one that is right, in both for some epochs."""
+    """A machine's clock is 20 h ahead, then right, some epochs each."""
     monkeypatch.setattr(solving, "MOST_EPOCHS", 1)
     monkeypatch.setattr("mapserver.calibration.ledger.PENDING_ROWS", 10)
     with closing(open_writer(tmp_path)) as writer:

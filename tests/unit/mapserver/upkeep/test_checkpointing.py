@@ -1,4 +1,4 @@
-"""The job that makes checkpoints, on a real writer and store."""
+"""The checkpoint job on a real writer and store."""
 
 import shutil
 import threading
@@ -57,7 +57,7 @@ class Site:
 
     @property
     def hours(self) -> list[float]:
-        """When those that can be used are closed."""
+        """Closing times of the usable ones."""
         facts = self.past.depends_on(self.reader, self.writer.run(lambda store: store.facts))
         entries = self.past.checkpoints.entries(facts, self.reader.last_row)
         return [(entry.closed_ns - NOW_NS) / HOUR_NS for entry in entries if entry.usable]
@@ -100,7 +100,7 @@ def test_hours_of_the_last_day_are_made_and_days_stay(opened):
         assert all(site.is_true(hour) for hour in (8.2, 9, 10.4, 11.9))
         site.drive([30, 36.5])
         site.run()
-        assert site.hours == [12, 31]  # of the first day the last one
+        assert site.hours == [12, 31]  # only the last of the first day
         site.drive([60])
         site.run()
         assert site.hours == [12, 37]

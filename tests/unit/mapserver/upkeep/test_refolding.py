@@ -1,4 +1,4 @@
-"""Maps folded again beside the writer, for decisions of trust and for corrections: all are one fold, bit for bit."""
+"""Refolds beside the writer, after trust decisions and corrections: all are one fold, bit for bit."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ BATCH = 20
 
 
 class HeldFold:
-    """Stands in front of `fold_history`: each fold waits until it may go on. without: of each fold that began."""
+    """In front of `fold_history`: holds each fold until released. without: of each fold begun."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.without: list[set[str]] = []
@@ -154,7 +154,7 @@ def test_the_solver_decides_nothing_new_until_the_map_follows_unless_it_is_asked
     with closing(Refolding(writer, past_of(writer))) as refolds:
         refolds.calibrate(solved(0.001), NOW_NS, asked=True)
         fold.wait(1)
-        for due in range(1, 10):  # far more often than a map can be folded
+        for due in range(1, 10):  # far more often than folds
             assert refolds.calibrate(solved(0.002), NOW_NS + due * EVERY_NS) == 1
         assert refolds.calibrate(solved(0.003), NOW_NS, asked=True) == 2
         fold.may_go_on.set()
@@ -196,8 +196,8 @@ def test_a_decision_that_is_taken_back_during_its_fold_leaves_the_map(writer, fo
 
 
 def room(store: Store, *, full: bool) -> None:
-    """Let the journal's file grow no further, as on a full disk."""
-    store.journal._db.execute(f"PRAGMA max_page_count={1 if full else 2**30}")  # 1: the file as large as it is
+    """Fill or free the journal's disk."""
+    store.journal._db.execute(f"PRAGMA max_page_count={1 if full else 2**30}")  # 1: as large as it is
 
 
 def test_a_decision_that_cannot_be_written_does_not_count_and_is_said_so(writer, tmp_path):
@@ -387,7 +387,7 @@ def test_a_snapshot_that_lacks_a_fact_is_folded_again(tmp_path):
 
 
 def looked(log: ChangeLog, grid: Grid) -> list[object]:
-    """What a search for changes finds in all that was folded since the last look."""
+    """Changes found in all folds since the last look."""
     blocks = grid.take_touched(10_000)
     wide = sorted({near for block in blocks for near in around(block, reach_blocks(SITE.cell_m, CONFIG.change))})
     pages = {block: pages for block, pages in zip(wide, grid.pages(wide), strict=True) if pages}
@@ -395,7 +395,7 @@ def looked(log: ChangeLog, grid: Grid) -> list[object]:
 
 
 def passes(c_rr: float, hours: range, zero: float) -> Table:
-    """Many passes over a field of 24 by 24 cells, by a machine whose zero is off."""
+    """Many passes over 24 by 24 cells by a machine with this zero."""
     x, y = (v.ravel() + 0.5 for v in np.meshgrid(np.arange(24), np.arange(24)))
     parts = []
     for hour in hours:
@@ -409,7 +409,7 @@ def passes(c_rr: float, hours: range, zero: float) -> Table:
 
 @pytest.mark.slow
 def test_a_correction_is_never_taken_for_a_change_of_the_ground_and_hides_none(writer):
-    zero = 0.12  # so large that samples with and without it are of different classes
+    zero = 0.12  # large enough to change the class
     log = ChangeLog(SITE.cell_m, CONFIG.change, CONFIG.read)
     gravel, paved = passes(0.2, range(4), zero), passes(0.02, range(5, 9), zero)
     send(writer, [incoming(gravel)])

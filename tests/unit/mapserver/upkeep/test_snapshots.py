@@ -1,4 +1,4 @@
-"""The job that has snapshots written, on a real writer and store."""
+"""The snapshot job on a real writer and store."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -22,7 +22,7 @@ class Site:
         self._seq = 0
 
     def rows_after(self, samples_sent: int, passed_s: float = 0.0) -> list[int]:
-        """Rows of the snapshots after so many more samples, a row each, and so much time."""
+        """Snapshot rows after more samples (a row each) and time."""
         for _ in range(samples_sent):
             self._seq += 1
             send(self.writer, [incoming(samples(1), self._seq)])

@@ -1,4 +1,4 @@
-"""The upkeep and its jobs on a real writer and store: machines are excluded, changes published, old rows archived."""
+"""The upkeep on a real writer and store: exclusion, published changes, archiving."""
 
 import shutil
 import threading
@@ -91,7 +91,7 @@ def store(tmp_path):
 
 
 def fleet(bad: dict[str, float], passes: int = 2, size: int = 48) -> dict[str, list[Any]]:
-    """Four machines that sweep the same three zones; those in `bad` report c_rr times a gain."""
+    """Four machines sweeping three zones; those in `bad` report c_rr times a gain."""
     zone = np.array([ZONES[i].c_rr for i in (0, 2, 3)])
     sent: dict[str, list[Any]] = {}
     for i, name in enumerate("abcd"):
@@ -132,7 +132,7 @@ def test_turns_of_a_large_fleet_leave_most_of_the_time_to_others(worked_s, pause
 
 def test_a_machine_that_contradicts_all_others_is_excluded(opened):
     sent = fleet({"c": 1.6})
-    with opened(judge_s=JUDGE_S, calibrates=False) as site:  # its evidence is of what it sent
+    with opened(judge_s=JUDGE_S, calibrates=False) as site:  # its evidence is as sent
         deliver(site, sent)
         wait_for(lambda: site.writer.run(lambda store: store.facts).excluded == {"c"})
         row = site.machine("c")
@@ -219,7 +219,7 @@ def test_rows_that_are_old_enough_move_to_the_archive_and_the_map_stays(store, t
     archiving(writer, reader, after_h).run()
     assert reader.archived_row == (4 if after_h == 1.0 else 0)
     assert bool(list((tmp_path / "store" / FOLDER).glob("*.parquet"))) == (after_h == 1.0)
-    shutil.copytree(tmp_path / "store", tmp_path / "copy")  # as a kill leaves it: without a snapshot
+    shutil.copytree(tmp_path / "store", tmp_path / "copy")  # as after a kill: no snapshot
     with closing(open_store(tmp_path / "copy")) as again:  # folded from archive and journal
         assert same(again.grid, folded(rows))
     assert same(writer.run(grid_copy), folded(rows))
@@ -255,7 +255,7 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
         with pytest.raises(QueryError, match=f"the decision is kept, but the map is not folded again .*{path.name}"):
             site.upkeep.trust("a", False, "", 0.5)
         assert path.name in caplog.text
-        wait_for(lambda: caplog.text.count("job=refolding") > 1)  # it is tried again
+        wait_for(lambda: caplog.text.count("job=refolding") > 1)  # tried again
         assert len(reader.events("trust")) == 1
         send(site.writer, [incoming(samples(5), 6)])
         assert site.grid.state().folded == 10
@@ -289,7 +289,7 @@ def test_a_fleet_that_takes_long_to_judge_is_judged_a_piece_in_every_turn(store,
 def test_corrected_samples_are_judged_also_those_that_came_before_the_correction(store):
     writer, reader = store
     sent = fleet({})
-    for rows in sent["c"]:  # its torque reads too much, and most of it is spent on a slope
+    for rows in sent["c"]:  # high torque, mostly spent on a slope
         rows["c_rr"] += 0.6 * (rows["c_rr"] + rows["grade_e"])
     for name, (first, second) in sent.items():
         send(writer, [incoming(np.concatenate([first, second]), 1, name)])

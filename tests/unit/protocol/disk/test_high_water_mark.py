@@ -1,4 +1,4 @@
-"""The mark beside a database: it never claims more than was written, whatever becomes of its file."""
+"""The mark beside a database never exceeds what was written, whatever happens to its file."""
 
 from __future__ import annotations
 

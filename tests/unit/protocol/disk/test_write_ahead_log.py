@@ -1,4 +1,4 @@
-"""Damage in the middle of a write-ahead log is told from a torn tail: SQLite itself is the judge of what is dropped."""
+"""Write-ahead logs: damage inside against a torn tail, with SQLite as reference."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def log_of(folder: Path) -> bytes:
 
 
 def recovered_rows(folder: Path, log: bytes) -> int:
-    """What SQLite makes of a log."""
+    """Rows recovered by SQLite."""
     copy = folder / "copy"
     copy.mkdir(exist_ok=True)
     (copy / "t.db").write_bytes((folder / "t.db").read_bytes())
@@ -47,7 +47,7 @@ def recovered_rows(folder: Path, log: bytes) -> int:
     with closing(sqlite3.connect(copy / "t.db")) as db:
         try:
             return db.execute("SELECT COUNT(*) FROM t").fetchone()[0]
-        except sqlite3.OperationalError:  # not even the table is there
+        except sqlite3.OperationalError:  # no table
             return 0
 
 
@@ -96,12 +96,12 @@ def test_a_log_of_any_length_with_a_damaged_header_holds_nothing(tmp_path, db):
     fill(db, random.Random(3), 3)
     log = log_of(tmp_path)
     for end in range(HEADER, len(log), 1000):
-        for at in (0, 11, 24):  # what tells a log, the size of its pages, the checksum
+        for at in (0, 11, 24):  # magic, page size, checksum
             assert scan(flipped(log[:end], at, 0)).recovered == 0
 
 
 def test_a_torn_tail_is_no_damage(tmp_path, db):
-    """Each part of the last transaction, in any order, may be missing after a power cut."""
+    """A power cut may lose any part of the last transaction."""
     rng = random.Random(4)
     fill(db, rng, 10)
     end = len(log_of(tmp_path))
@@ -119,7 +119,7 @@ def test_a_torn_tail_is_no_damage(tmp_path, db):
 
 
 def test_what_rolled_back_transactions_left_is_no_damage(tmp_path, db):
-    """Long ones spill pages into the log, which shorter ones then overwrite in part."""
+    """Long ones spill pages into the log, partly overwritten by shorter ones."""
     rng = random.Random(5)
     fill(db, rng, 3)
     db.execute("PRAGMA cache_size=2")

@@ -1,4 +1,4 @@
-"""Columns and files of a log: what may stand in place of a reading's own columns, and how files are written."""
+"""Log columns and files: substitutes for a reading's columns, and file syntax."""
 
 import math
 from pathlib import Path
@@ -49,7 +49,7 @@ def test_fixes_in_metres_come_back_as_the_metres_that_they_were(tmp_path: Path, 
     fix = only(log)
     x, y, z = Projection(log.site).to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
     assert (x, y) == pytest.approx(place, abs=1e-5)
-    assert z == 0.0  # a height that nobody states is the origin's
+    assert z == 0.0  # an unstated height is the origin's
     assert (fix.var_e_m2, fix.var_n_m2) == (2.0, 3.0)
 
 
@@ -86,7 +86,7 @@ def test_a_value_that_cannot_be_is_refused_with_its_line(tmp_path: Path, row: st
     ],
 )
 def test_a_variance_that_is_not_known_is_that_of_std(tmp_path: Path, kind: str, described: str, quantity: str) -> None:
-    """As drivers write it: 0; a stated one stays, since `std` is used in its place later."""
+    """Drivers write 0 for unknown; stated ones stay, `std` replaces them later."""
     text = "t,x,y,v\n0,1,2,0\n1,1,2,0.0\n2,1,2,4\n"
     log = opened(tmp_path, text, kind, described, f"std = {{ {quantity} = 3.0 }}")
     variances = [
@@ -103,7 +103,7 @@ def test_a_variance_that_is_not_known_is_that_of_std(tmp_path: Path, kind: str, 
     ("course", "east", "north"), [(0.0, 0.0, 2.0), (90.0, 2.0, 0.0), (225.0, -math.sqrt(2), -math.sqrt(2))]
 )
 def test_speed_and_course_become_a_velocity(tmp_path: Path, course: float, east: float, north: float) -> None:
-    """As a receiver states them: knots, and degrees clockwise from north."""
+    """In a receiver's units: knots, degrees clockwise from north."""
     described = 'speed_mps = { column = "kn", unit = "kn" }, course_deg = "course"'
     text = f"t,kn,course\n1,{2 * 3600 / 1852},{course}\n"
     velocity = only(opened(tmp_path, text, "gps_velocity", described, "std = { velocity = 0.2 }"))
@@ -187,7 +187,7 @@ def test_a_speed_is_the_mean_of_wheels_and_a_turn_is_their_difference_over_the_t
 
 
 def test_an_offset_counts_in_the_unit_of_the_file(tmp_path: Path) -> None:
-    """A raw value of a bus: 0.1 km/h a step, counted from -40 km/h."""
+    """A bus's raw value: 0.1 km/h per step from -40 km/h."""
     columns = WHEELS.replace('"v"', '{ columns = { v = 0.1 }, offset = -40.0, unit = "km/h" }')
     made = speeds(wheels(tmp_path, "t,v,w\n0,436,0\n1,400,0\n", columns=columns))
     assert [v for v, _ in made] == pytest.approx([1.0, 0.0])

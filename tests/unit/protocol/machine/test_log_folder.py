@@ -143,7 +143,7 @@ def test_files_below_the_data_folder_are_read_also_through_links(tmp_path):
     assert len(list(open_log(tmp_path.parent / f"{tmp_path.name}-link").readings())) == 1
 
 
-# --- what is written reads back --------------------------------------------------------------------------------------
+# --- round trips -----------------------------------------------------------------------------------------------------
 
 SITE = SiteConfig("paper", 49.1, 8.4, 110.5)
 MOUNT = Mount((0.1, -0.2, 3.0), (0.0, 90.0, -90.0))
@@ -157,7 +157,7 @@ def recordings(draw):
     readings = []
     for kind, cls in KINDS.items():
         limits = [st.floats(low, high) for low, high in cls.limits.values()]
-        stamps = st.integers(T0, T0 + 11 * 3600 * 10**9)  # a recording breaks off for less than half a day
+        stamps = st.integers(T0, T0 + 11 * 3600 * 10**9)  # recordings end within half a day
         readings += draw(st.lists(st.builds(cls, st.just(f"{kind}-1"), stamps, *limits), max_size=3))
     return sorted(readings, key=lambda r: r.stamp_ns)
 

@@ -1,4 +1,4 @@
-"""Stamps of a file that are far off are refused alone; where a clock was set, the rest of the file counts."""
+"""Far-off stamps of a file are refused singly; after a clock's setting the rest counts."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def shifted(stamps: list[float], by_s: float) -> list[float]:
     return [stamp + by_s for stamp in stamps]
 
 
-ASTRAY = {  # the rows, and how many are refused, by reason
+ASTRAY = {  # rows, refusals by reason
     "first ahead": ([YEARS, *EVEN], {"stamp_ahead": 1}),
     "first behind": ([-YEARS, *EVEN], {"stamp_goes_back": 1}),
     "a day ahead": ([*EVEN[:300], DAY, *EVEN[300:]], {"stamp_ahead": 1}),
@@ -64,7 +64,7 @@ def test_a_file_without_any_order_is_refused_in_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("step_s", [-3600.0, 3600.0])
 def test_sensors_whose_clock_was_set_stay_in_step(tmp_path: Path, step_s: float) -> None:
-    """Before and after: neither sensor is ever more than two rows ahead of the other."""
+    """Throughout: no sensor is over two rows ahead of the other."""
     rows = [*EVEN, *shifted(EVEN, EVEN[-1] + 0.2 + step_s)]
     names = [reading.sensor for reading in log_of(tmp_path, a=rows, b=shifted(rows, 0.05)).readings()]
     assert len(names) == 2 * len(rows)

@@ -1,4 +1,4 @@
-"""Lists of places, outlines, routes and ways: read as they were written, and refused by name where they are none."""
+"""Lists of places, outlines, routes, ways: round trips, and refusals by name."""
 
 import math
 
@@ -40,7 +40,7 @@ def test_a_ring_is_an_outline_in_either_direction(count, radius_m, resolution_m)
 
 
 def test_sides_that_cross_are_found_wherever_they_are():
-    """Against a plain check of all pairs, on outlines that nobody chose."""
+    """Against a plain check of all pairs, on random outlines."""
     draw = np.random.default_rng(5)
     crossed = 0
     for _ in range(300):

@@ -1,4 +1,4 @@
-"""What no query may ask, a row each: refused by its reason, with the parameter by its name, before any map is read."""
+"""Impossible queries, a row each: refused with reason and parameter before any map is read."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from protocol.queries.places import MAX_CORNERS, MAX_PLACES
 from protocol.queries.requests import parse_query
 
 REFUSED = [
-    # --- points, regions, histories, and what goes with all of them
+    # --- points, regions, histories and their options
     ("weather", {}, Refusal.UNKNOWN_QUERY, "weather"),
     ("point", {"x": "1", "y": "2", "colour": "red"}, Refusal.UNKNOWN_PARAMETER, "colour"),
     ("point", {"x": "1"}, Refusal.MISSING_FIELD, "`y`"),

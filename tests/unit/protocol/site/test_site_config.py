@@ -98,7 +98,7 @@ def test_how_far_inside_of_known_ground_a_place_is(area, place, metres):
 
 @given(st.floats(-20, 30), st.floats(-20, 30))
 def test_known_ground_has_the_same_inside_as_its_parts(x, y):
-    """The hook is made of two rectangles."""
+    """The hook is two rectangles."""
     inside = (0 < x < 9 and 0 < y < 3) or (6 < x < 9 and 0 < y < 9)
     if abs(HOOK.inside_m(x, y)) > 1e-6:
         assert (HOOK.inside_m(x, y) > 0) == inside

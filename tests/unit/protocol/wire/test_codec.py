@@ -39,7 +39,7 @@ def batch(table: np.ndarray, **fields) -> SampleBatch:
 
 
 def changed(**fields) -> bytes:
-    """A valid batch with fields replaced; ... takes a field away."""
+    """A valid batch with replaced fields; ... removes one."""
     table = {**msgpack.unpackb(encode_batch(batch(rows()))), **fields}
     return msgpack.packb({name: value for name, value in table.items() if value is not ...})
 
@@ -58,7 +58,7 @@ def refusal(data: bytes, decode=lambda data: decode_batch(data, EXTENT_M)) -> Me
     return caught.value
 
 
-# --- one clear error for each kind of bad batch ----------------------------------------------------------------------
+# --- one clear error per kind of bad batch ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_what_is_cut_off_goes_on_or_is_no_map_is_refused(data):
         ({"n": 4}, Refusal.COLUMN_LENGTH, "cols.stamp_ns"),
         ({"first_seq": 0}, Refusal.FIRST_SEQ, "first_seq"),
         ({"first_seq": 2**63}, Refusal.FIRST_SEQ, "first_seq"),
-        ({"first_seq": codec.MAX_SEQ}, Refusal.FIRST_SEQ, "first_seq"),  # the last one's number is beyond
+        ({"first_seq": codec.MAX_SEQ}, Refusal.FIRST_SEQ, "first_seq"),  # the last number is too large
         ({"lost_before": 1}, Refusal.OUT_OF_RANGE, "lost_before"),
         ({"lost_before": -1}, Refusal.OUT_OF_RANGE, "lost_before"),
         ({"spool_id": 0}, Refusal.OUT_OF_RANGE, "spool_id"),
@@ -106,7 +106,7 @@ def test_column_of_another_length_is_named(column, change):
     assert (error.reason, error.field) == (Refusal.COLUMN_LENGTH, f"cols.{column}")
 
 
-GROUPED = {"c_rr_var": "c_rr", "grade_n": "grade_e", "grade_var": "grade_e"}  # NaN together, or not at all
+GROUPED = {"c_rr_var": "c_rr", "grade_n": "grade_e", "grade_var": "grade_e"}  # NaN together or not at all
 
 
 @pytest.mark.parametrize("column", COLUMNS)
@@ -286,7 +286,7 @@ def test_live_messages_carry_a_plausible_stamp(stamp):
     health = Health("m-1", stamp, {"readings": 0})
     if stamp:
         assert refusal(codec.encode_health(health), codec.decode_health).field == "stamp_ns"
-    else:  # an agent that has read nothing yet
+    else:  # an agent without readings
         assert codec.decode_health(codec.encode_health(health)) == health
 
 
@@ -319,7 +319,7 @@ def test_a_number_beyond_64_bits_is_the_greatest_and_anything_else_is_refused():
         pack({"n": object()})
 
 
-# --- an offer in an acknowledgement ----------------------------------------------------------------------------------
+# --- offers in acknowledgements --------------------------------------------------------------------------------------
 
 OFFER = CalibrationOffer("loader-1", 1_750_000_000_000_000_000, 0.004, -0.05, 4e-7, 2e-5, 1e-6)
 STORE_ID = "0123456789abcdef"

@@ -1,4 +1,4 @@
-"""The wire does not change by accident: stored bytes, records, and the code agree both ways."""
+"""The wire never changes by accident: stored bytes, records and code agree both ways."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ NAMES = sorted(path.name for path in FOLDER.glob("*.bin"))
 
 
 def same(a, b) -> bool:
-    """Equality of records, NaN and arrays by their bytes."""
+    """Equality of records, NaN and arrays by bytes."""
     if isinstance(a, np.ndarray):
         return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
     if dataclasses.is_dataclass(a):

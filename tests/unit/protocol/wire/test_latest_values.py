@@ -1,4 +1,4 @@
-"""Names are made up where there are no keys: they are few, nobody who speaks is forgotten, and the silent make room."""
+"""Values of invented names, without keys: bounded; speakers stay, the silent make room."""
 
 from protocol.wire.latest_values import MOST_NAMES, SILENT_S, LatestValues
 
@@ -13,7 +13,7 @@ def test_who_speaks_keeps_its_place_and_the_silent_make_room():
     now_s = SILENT_S - 1
     assert heard.hear("loader-1", 1)
     assert not heard.hear("loader-2", 1)
-    now_s = SILENT_S + 1  # the made-up ones are silent by now
+    now_s = SILENT_S + 1  # the invented ones are silent by now
     for i in range(MOST_NAMES - 1):
         assert heard.hear(f"loader-{i + 2}", i)
     assert (heard.get("loader-1"), heard.get("made-up-1")) == (1, None)

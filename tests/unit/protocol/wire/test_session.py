@@ -47,7 +47,7 @@ def test_wrong_settings_are_named(fields, words):
 
 @pytest.mark.parametrize(("mode", "end"), [("client", "connect"), ("router", "listen")])
 def test_both_ends_prove_their_names(mode, end):
-    """Without enable_mtls at the client it would show no certificate; without it at the router none is asked for."""
+    """Without enable_mtls a client shows no certificate, and a router requests none."""
     tls = _settings(SessionConfig("tls/127.0.0.1:1", mode, credentials=CREDENTIALS))["transport/link/tls"]
     assert tls["enable_mtls"] is tls["verify_name_on_connect"] is tls["close_link_on_expiration"] is True
     assert tls["root_ca_certificate"] == "/keys/a/ca.pem"
