@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 TESTS := $(BIN)/python -m pytest --quiet --numprocesses auto --dist worksteal
 SIZE_demo := 340 MB to load, 1.2 GB on disk
-SIZE_docs := 120 MB to load, 330 MB on disk
+SIZE_docs := 100 MB to load, 400 MB on disk
 SIZE_dev := 670 MB to load, 2.4 GB on disk
 
 # make quick: unit tests that are not slow, in about a minute. make test: the proof. make nightly, make weekly: what

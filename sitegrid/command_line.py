@@ -97,7 +97,7 @@ def build_parser(commands: ModuleType = commands, program: str = "sitegrid") -> 
     `--help` lists them by the package's `GROUPS`: heading to names.
     """
     about = (commands.__doc__ or "").partition("\n")[0]
-    parser = CommandParser(prog=program, description=about, formatter_class=RawDescriptionHelpFormatter)
+    parser: ArgumentParser = CommandParser(prog=program, description=about, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("--version", action="version", version=f"sitegrid {package_version()}")
     nouns = parser.add_subparsers(metavar="COMMAND", required=True, help="one of those below; COMMAND --help says more")
     those = pkgutil.walk_packages(commands.__path__, f"{commands.__name__}.")
