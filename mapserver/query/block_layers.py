@@ -114,7 +114,8 @@ class BlockLayers:
             self._cells.move_to_end(block)
             self.used += 1
         at = row % n * n + column % n
-        return {name: float(np.float32(_at(kept.layers, name, state.newest_ns)[at])) for name in names}
+        now_ns = state.newest_ns
+        return {name: float(np.float32(_at(kept.layers, name, now_ns)[at])) for name in names}
 
     def look_squares(self, state: MapState | StillMap, squares: Set[Block], names: Sequence[str]) -> Look:
         """Sources of area layers in squares."""

@@ -31,13 +31,13 @@ def reasons(
     names: of machines in the map; they share 64 bits, so with many machines one may be listed wrongly.
     """
     block = cell[0] // BLOCK_CELLS, cell[1] // BLOCK_CELLS
-    pages = view.pages.get(block, NO_PAGES)
-    first = valid_pages(view.pages, cell_m, config.change, view.ages).get(block)
+    pages, all_pages = view.pages.get(block, NO_PAGES), np.zeros(ev.CELLS, np.int64)
+    first = valid_pages(view.pages, cell_m, config.change, view.ages, only=view.pages.keys() & {block})
     place = cell[1] % BLOCK_CELLS * BLOCK_CELLS + cell[0] % BLOCK_CELLS
-    holds = _one(evidence([pages], None if first is None else [first]), place)
-    everything = _one(evidence([pages]), place)
-    before = dataclasses.replace(everything, counts=everything.counts - holds.counts)
-    bits = int(holds.bitmaps[0, 0, ev.MACHINES])
+    sums = _cell(evidence([pages, pages], [first.get(block, all_pages), all_pages]), place)
+    sums.counts[1] -= sums.counts[0]  # what holds, and what was before its change
+    values, before = _values(sums, config)
+    bits = sums.bitmaps[0, 0, ev.MACHINES]
     return CellReasons(
         store=view.version.store,
         merged=view.version.row,
@@ -46,39 +46,44 @@ def reasons(
         x_m=(cell[0] + 0.5) * cell_m,
         y_m=(cell[1] + 0.5) * cell_m,
         cell_m=cell_m,
-        values=_values(holds, config),
-        before=_values(before, config),
-        metres=float(holds.weight[0, 0]) / ev.WEIGHT_UNITS_PER_M,
-        newest_ns=int(holds.newest_ns[0, 0]),
-        changed_ns=int(holds.changed_ns[0, 0]),
-        resistance=_votes(holds, before, ev.RESISTANCE, ev.RESISTANCE_CENTRES),
-        grade_east=_votes(holds, before, ev.GRADE_EAST, ev.GRADE_CENTRES),
-        grade_north=_votes(holds, before, ev.GRADE_NORTH, ev.GRADE_CENTRES),
-        sectors=_metres(holds, ev.HEADING),
-        machines=tuple(sorted(name for name in names if bits >> machine_bit(name) & 1)),
+        values=values,
+        before=before,
+        metres=float(sums.weight[0, 0]) / ev.WEIGHT_UNITS_PER_M,
+        newest_ns=int(sums.newest_ns[0, 0]),
+        changed_ns=int(sums.changed_ns[0, 0]),
+        resistance=_votes(sums, ev.RESISTANCE, ev.RESISTANCE_CENTRES),
+        grade_east=_votes(sums, ev.GRADE_EAST, ev.GRADE_CENTRES),
+        grade_north=_votes(sums, ev.GRADE_NORTH, ev.GRADE_CENTRES),
+        sectors=_metres(sums, ev.HEADING)[0],
+        machines=tuple(sorted(name for name, bit in machine_bits(names).items() if bits & bit)),
     )
 
 
-def machine_bit(name: str) -> int:
-    """Bit of a machine in a cell."""
-    return name_hash(name) >> MACHINE_SHIFT
+def machine_bits(names: Iterable[str]) -> dict[str, np.uint64]:
+    """Bit of each machine in a cell."""
+    known = list(names)
+    hashes = np.array(list(map(name_hash, known)), np.uint64)
+    return dict(zip(known, np.uint64(1) << (hashes >> np.uint64(MACHINE_SHIFT)), strict=True))
 
 
-def _one(sums: ev.Evidence, place: int) -> ev.Evidence:
-    """One cell of one block, arrays (1, 1, ...)."""
+def _cell(sums: ev.Evidence, place: int) -> ev.Evidence:
+    """One cell of blocks, arrays (blocks, 1, ...)."""
     parts = {item.name: getattr(sums, item.name)[:, place : place + 1] for item in dataclasses.fields(sums)}
     return ev.Evidence(**parts)
 
 
-def _values(sums: ev.Evidence, config: ServerConfig) -> dict[str, float | None]:
+def _values(sums: ev.Evidence, config: ServerConfig) -> list[dict[str, float | None]]:
     layers = cell_layers.read(sums, LAYERS, config.read)
-    values = {name: float(layer[0, 0]) for name, layer in layers.items()}
-    return {name: None if math.isnan(value) else value for name, value in values.items()}
+    rows = np.stack([layer[:, 0] for layer in layers.values()], axis=1).astype(np.float64).tolist()
+    return [
+        {name: None if math.isnan(value) else value for name, value in zip(layers, row, strict=True)} for row in rows
+    ]
 
 
-def _votes(holds: ev.Evidence, before: ev.Evidence, part: slice, centres: AnyArray) -> Votes:
-    return Votes(tuple(np.asarray(centres).tolist()), _metres(holds, part), _metres(before, part))
+def _votes(sums: ev.Evidence, part: slice, centres: AnyArray) -> Votes:
+    return Votes(tuple(np.asarray(centres).tolist()), *_metres(sums, part))
 
 
-def _metres(sums: ev.Evidence, part: slice) -> tuple[float, ...]:
-    return tuple((sums.counts[0, 0, part].astype(np.float64) / ev.WEIGHT_UNITS_PER_M).tolist())
+def _metres(sums: ev.Evidence, part: slice) -> tuple[tuple[float, ...], ...]:
+    """Metres of votes, of each block's cell."""
+    return tuple(map(tuple, (sums.counts[:, 0, part].astype(np.float64) / ev.WEIGHT_UNITS_PER_M).tolist()))

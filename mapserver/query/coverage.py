@@ -12,7 +12,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import chunks
 from mapserver.evidence.timeline import Block, evidence
 from mapserver.layers import cell_layers
-from mapserver.query.cell_reasons import machine_bit
+from mapserver.query.cell_reasons import machine_bits
 from mapserver.query.views import View
 from protocol.arrays import Bools
 from protocol.queries.coverage import Coverage
@@ -26,7 +26,7 @@ def coverage(
     view: View, window: CellWindow | None, names: Iterable[str], cell_m: float, config: ServerConfig
 ) -> Coverage:
     """Count cells of a window or the whole view; names: of machines in the map."""
-    bits = {name: np.uint64(1) << np.uint64(machine_bit(name)) for name in names}
+    bits = machine_bits(names)
     since_ns = {name: view.stamp_ns - seconds * 10**9 for name, seconds in SINCE_S.items()}
     counts = dict.fromkeys(("driven", "known", *since_ns, *(f"by {name}" for name in bits)), 0)
     first = valid_pages(view.pages, cell_m, config.change, view.ages)
