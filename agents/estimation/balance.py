@@ -46,7 +46,7 @@ class Balance:
     the accelerometer alone. pitch_radps: nose up. yaw_radps: left. norm_mps2: of the specific force. on_front: load
     share of the front axle, 0 if unknown. body_mps2: acceleration ahead by the accelerometer. torque_s, wheels_s: age
     of the newest reading. mass_kg: with payload. brake: applied share of a brake without force reading, 0 to 1; NaN
-    without any brake reading. share_var: of share, by torque steps. unknown: why the drive force is unknown, or "".
+    without any brake reading. share_var: of share, by the powertrain. unknown: why the drive force is unknown, or "".
     """
 
     stamp_ns: int
@@ -84,7 +84,7 @@ class BalanceStep:
     """One usable step of the force balance: raw = direction cos(slope) c_rr + scale error * share.
 
     stamp_ns: its end. distance_m: since the last usable step. raw: calibrated [-]. regressor: direction cos(slope) [-].
-    share: drive force over weight, signed ahead [-]; share_var: by torque steps. lead_share: load share of the leading
+    share: drive force over weight, signed ahead [-]; share_var: by the powertrain. lead_share: load share of the leading
     axle; wheelbase_m, lead_m: trailing axle and load centre behind it; without a wheelbase, one ground.
     """
 

@@ -105,7 +105,8 @@ class Calibrator:
         self._stretch.append(balance)
         if balance.distance_m - self._stretch[0].distance_m < self._tuning.stretch_m:
             return
-        variance = self._tuning.stretch_std**2 + shaking_var / len(self._stretch) ** 2  # a shaking body goes nowhere
+        # A body that shakes goes nowhere; what the powertrain leaves open stays the same over a stretch.
+        variance = self._tuning.stretch_std**2 + shaking_var / len(self._stretch) ** 2 + balance.share_var
         stretch = self._end_stretch(dead_reckoning)
         if known_c_rr is not None:
             cosine = math.cos(balance.slope_x)

@@ -214,7 +214,8 @@ class GroundEstimator:
         if resistance:
             cosine = math.cos(judged.slope_x)
             c_rr = resistance[0]
-            variance = resistance[1] + applied.variance(balance.share) / cosine**2 + self._tuning.model_std**2
+            steady_var = applied.variance(balance.share) + balance.share_var
+            variance = resistance[1] + steady_var / cosine**2 + self._tuning.model_std**2
         reason = judged.reason or ("" if resistance else "settling")
         slope_x = math.tan(judged.slope_x + applied.zero)  # the accelerometer's bias is an error of the slope too
         # Mean of both directions: nothing shows the bias across.

@@ -5,8 +5,9 @@ of it. With gear and final drive i, efficiency eta and wheels of radius r,
 
     F = (torque - losses) T_ref i eta / r        with 1 / eta where the wheels drive the engine
 
-The gear is the one whose ratio the speeds of engine and wheels have; between two gears something slips. Where a clutch,
-a converter or hydraulics leave the force unknown, a reason stands in its place.
+The gear is the one whose ratio the speeds of engine and wheels have; between two gears something slips. A retarder
+behind the gearbox takes its torque, by the final drive. Where a clutch, a converter, hydraulics or a retarder of
+unknown torque leave the force unknown, a reason stands in its place.
 """
 
 import math
@@ -22,23 +23,23 @@ from protocol.machine.readings import (
     Motor,
     MotorPower,
     Reading,
+    Retarder,
     Torque,
 )
 
-STEP = 0.01  # of an engine's torque, in shares of the reference torque (J1939)
+STEP = 0.01  # of the torque of an engine, its losses and a retarder, in shares of their reference torque (J1939)
+RETARDER_STD = 0.05  # of a retarder's torque: controllers know it by its pressure; assumed
 SAME_GEAR = 0.07  # logarithm of two ratios: gears of a 16-speed gearbox differ by 0.18; tyres wear, speeds have steps
 CREEPS_MPS = 0.5  # power over a lower speed is no force
 MAX_AGE_NS = 10**9  # of what is read beside the torque; EEC3 comes each 250 ms
-# Why a drive force is not known, in a word that health and counters carry.
-REASONS = frozenset({"clutch", "gear_change", "converter", "no_gear", "hydraulics", "creeps"})
 # The value that is averaged over a step, by the kind of reading; where several kinds come in, the first counts.
 DRIVES = {Torque: "torque_nm", Motor: "torque_nm", MotorPower: "power_w", Engine: "torque"}
-BESIDE = EngineLosses, Driveline, HydraulicPressure
+BESIDE = EngineLosses, Driveline, HydraulicPressure, Retarder
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """Drive force [N], signed ahead; its variance by the torque's steps [N2]; why it is not known, "" where it is."""
+    """Drive force [N], signed ahead; its variance by how it is stated [N2]; why it is not known, "" where it is."""
 
     force_n: float = 0.0
     variance_n2: float = 0.0
@@ -80,6 +81,12 @@ class DriveReadings:
 
     def take(self, speed_mps: float) -> Drive:
         """The drive force over the step that ends; of what came in before it, where nothing came in it."""
+        drive, retarder = self._driven(speed_mps), self._fresh(Retarder)
+        if drive.unknown or not isinstance(retarder, Retarder):
+            return drive
+        return retarded(self._train, drive, retarder.torque, speed_mps, self._radius_m)
+
+    def _driven(self, speed_mps: float) -> Drive:
         (n, total), self._sums = self._sums, (0, 0.0)
         newest = self._newest.get(self._kind) if self._kind else None
         if newest is None:
@@ -95,7 +102,7 @@ class DriveReadings:
         return Drive(value / self._radius_m)
 
     def _engine(self, engine: Engine, torque: float, speed_mps: float) -> Drive:
-        losses, driveline, hydraulics = map(self._fresh, BESIDE)
+        losses, driveline, hydraulics = map(self._fresh, BESIDE[:3])
         why = slips(driveline) if isinstance(driveline, Driveline) else ""
         if idle_pa := self._train.idle_pressure_pa:
             is_idle = isinstance(hydraulics, HydraulicPressure) and hydraulics.pressure_pa <= idle_pa
@@ -118,7 +125,17 @@ def engine_drive(
     if not ratio:
         return Drive(unknown="no_gear")
     per_share_n = train.reference_torque_nm * ratio / radius_m
-    return Drive(_handed_on(train, share, 1.0) * per_share_n, (STEP * per_share_n) ** 2 / 12)
+    return Drive(_handed_on(train, share, 1.0) * per_share_n, 2 * _step_variance(per_share_n))
+
+
+def retarded(train: PowertrainConfig, drive: Drive, share: float, speed_mps: float, radius_m: float) -> Drive:
+    """What is left of a drive force while a retarder brakes with a share of its torque."""
+    per_share_n = train.retarder_torque_nm * train.final_drive / radius_m
+    if not share or not per_share_n:
+        return Drive(unknown="braking") if share else drive
+    force_n = share * per_share_n
+    variance = drive.variance_n2 + (RETARDER_STD * force_n) ** 2 + _step_variance(per_share_n)
+    return Drive(drive.force_n - math.copysign(force_n, speed_mps), variance)
 
 
 def motor_force(train: PowertrainConfig, torque_nm: float, speed_mps: float) -> float:
@@ -151,6 +168,11 @@ def gear_ratio(train: PowertrainConfig, engine_radps: float, wheel_radps: float)
     measured = engine_radps / abs(wheel_radps)
     off, ratio = min(((abs(math.log(measured / ratio)), ratio) for ratio in ratios), default=(math.inf, 0.0))
     return math.copysign(ratio, wheel_radps) if off < SAME_GEAR else 0.0
+
+
+def _step_variance(per_share_n: float) -> float:
+    """Of a force by a share in steps, each as likely anywhere in its step."""
+    return (STEP * per_share_n) ** 2 / 12
 
 
 def _handed_on(train: PowertrainConfig, value: float, direction: float) -> float:

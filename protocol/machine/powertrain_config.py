@@ -13,7 +13,7 @@ class PowertrainConfig:
     reference_torque_nm: 100 % engine torque (SPN 544). losses: friction and auxiliary drives, as a share of it, if not
     read. gears, reverse_gears: engine or motor turns per gearbox output turn; final_drive: output turns per wheel turn,
     axles and hubs together. efficiency: engine or motor to wheels. idle_pressure_pa: of engine-driven hydraulics; above
-    it their share is unknown. 0: none.
+    it their share is unknown. retarder_torque_nm: 100 % retarder torque at the gearbox output. 0: none, unknown.
     """
 
     reference_torque_nm: float = 0.0
@@ -23,9 +23,10 @@ class PowertrainConfig:
     final_drive: float = 1.0
     efficiency: float = 0.95
     idle_pressure_pa: float = 0.0
+    retarder_torque_nm: float = 0.0
 
     def __post_init__(self) -> None:
-        require_between(self, 0, 1e5, "reference_torque_nm")
+        require_between(self, 0, 1e5, "reference_torque_nm", "retarder_torque_nm")
         require_between(self, 0, 0.5, "losses")
         require_between(self, 0.1, 500, "final_drive")
         require_between(self, 0.3, 1, "efficiency")

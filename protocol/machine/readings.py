@@ -210,8 +210,18 @@ class HydraulicPressure(Reading):
 
 
 @dataclass(frozen=True, slots=True)
+class Retarder(Reading):
+    """Torque of a retarder as a share of its reference torque."""
+
+    kind: ClassVar[str] = "retarder"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"torque": (0, 1.25)}
+
+    torque: float
+
+
+@dataclass(frozen=True, slots=True)
 class Brake(Reading):
-    """Applied share of a brake or retarder, unseen by the torque; 0 or 1 of a switch."""
+    """Applied share of a brake, unseen by the torque; 0 or 1 of a switch."""
 
     kind: ClassVar[str] = "brake"
     limits: ClassVar[dict[str, tuple[float, float]]] = {"applied": (0, 1)}
@@ -276,6 +286,7 @@ KINDS: dict[str, type[Reading]] = {
         Motor,
         MotorPower,
         HydraulicPressure,
+        Retarder,
         Brake,
         BrakeForce,
         Articulation,

@@ -32,6 +32,7 @@ SOURCE, PRIORITY = 0x00, 3
 PUMP_RUNS_S, PUMP_RESTS_S = 3.0, 9.0  # on average; assumed
 IDLE_PA, MOST_PA = 2e6, 28e6
 FUEL_SCALE = 0.02  # standard deviation: controllers know the burnt fuel by the injectors' opening
+RETARDER_SCALE = 0.05  # and a retarder's torque by its pressure; assumed
 
 
 class BusNode:
@@ -47,7 +48,10 @@ class BusNode:
         unit = SensorUnit(index, rig, SensorConfig("torque", "torque"), generator(seed, index, "torque"))
         self._sensor, self._torque_nm = TorqueGroup([unit]), 0.0
         self._pump = Pump(self._train.hydraulics, generator(seed, index, "pump"))
-        self._fuel_scale = 1.0 + FUEL_SCALE * generator(seed, index, "fuel").standard_normal()
+        self._fuel_scale, self._retarder_scale = (
+            1.0 + std * generator(seed, index, name).standard_normal()
+            for std, name in ((FUEL_SCALE, "fuel"), (RETARDER_SCALE, "retarder"))
+        )
         known = all_signals(SIGNALS, "")
         self._groups: dict[int, list[Signal]] = defaultdict(list)
         for signal in known.values():
@@ -88,7 +92,7 @@ class BusNode:
     def _values(self, known: Shafts, wheels: Floats) -> Mapping[str, list[float]]:
         speed = np.abs(wheels) * self._radius_m
         columns = {
-            "retarder_torque": -known.retarder,
+            "retarder_torque": -known.retarder * self._retarder_scale,
             "driveline_engaged": np.ones(len(speed)),
             "converter_locked": known.locked,
             "gear_shifting": known.shifting,

@@ -33,7 +33,7 @@ class DriveTrain:
     """Drive train of a kind of machine; `sim/machines/*.toml` explain the values.
 
     data_sheet: what an agent may know; its `losses` are those at shift_up_rpm. stall_rpm, stall_ratio: of the
-    converter, engine speed and torque ratio against wheels that stand. retarder_nm: the most, at the final drive.
+    converter, engine speed and torque ratio against wheels that stand.
     hydraulics: the most that pumps beside the wheels take, as a share of the reference torque.
     """
 
@@ -43,7 +43,6 @@ class DriveTrain:
     shift_up_rpm: float
     stall_rpm: float
     stall_ratio: float
-    retarder_nm: float
     hydraulics: float
 
     def __post_init__(self) -> None:
@@ -126,7 +125,7 @@ def shafts(
     dragged_nm = np.minimum(wheels_nm, losses * full_nm * ratio / data.efficiency)
     net = np.where(drives, wheels_nm / (handed_on * converter), -dragged_nm * data.efficiency / ratio) / full_nm
     rest_nm = np.where(drives, 0.0, wheels_nm - dragged_nm)
-    most_nm = train.retarder_nm * data.final_drive
+    most_nm = data.retarder_torque_nm * data.final_drive
     torque = np.maximum(net + losses + pumps, 0.0)
     return Shafts(
         engine_radps=engine,

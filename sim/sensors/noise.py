@@ -18,7 +18,7 @@ STREAMS += ("articulation", "outage", "imu-4", "attitude-1", "attitude-2", "atti
 STREAMS += ("receivers", "driver")  # shared by a machine's receivers; its driver
 STREAMS += ("vibration",)  # shared by a machine's IMUs
 STREAMS += ("brake", "doppler-1", "doppler-2", "doppler-3")
-STREAMS += ("pump", "fuel")  # of a machine with CAN
+STREAMS += ("pump", "fuel", "retarder")  # of a machine with CAN
 SITE = 2**32 - 1  # in place of a machine's number: shared by the whole site
 # Drawn at a time, because a call costs more than a row. No power of two: rows of all sensors would share a few cache
 # lines (six times slower).

@@ -22,7 +22,7 @@ CAN_SENSORS = {
     "gearbox": SensorConfig("gearbox", "driveline"),
     "rear_speed": SensorConfig("speed", "odometry", measures=("speed",)),
     "brake_switch": SensorConfig("brakes", "brake"),
-    "retarder": SensorConfig("retarder", "brake"),
+    "retarder": SensorConfig("retarder", "retarder"),
     "fuel": SensorConfig("fuel", "fuel_rate"),
     "pump": SensorConfig("pump", "hydraulic_pressure"),
 }

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from agents.config import AgentConfig
+from agents.drivers.can.config import all_signals
 from agents.drivers.line import DECODERS, split_stream
-from agents.drivers.tables import DriverConfig
+from agents.drivers.tables import CAN, DriverConfig
 from agents.drivers.transports import open_transport, why_closed
 from protocol.errors import SitegridError, StoreError
 from protocol.machine.machine_config import MachineConfig
@@ -16,6 +18,7 @@ from protocol.wire.session import is_free
 from sitegrid.doctor import Finding, Level, disk, skipped
 from sitegrid.setup.files import PORTS, Folder
 from sitegrid.setup.hearing import HeardLine
+from sitegrid.setup.hearing_bus import listen_to_bus
 from sitegrid.setup.listening import listen_to
 
 LISTEN_S = 2.5  # receivers send every second
@@ -66,6 +69,10 @@ def _receivers(site: SiteConfig, config: AgentConfig) -> list[Finding]:
     drivers = [driver for driver in config.driver if driver.kind in DECODERS]
     heard = listen_to([driver.address for driver in drivers], LISTEN_S)
     findings = [check_receiver(driver, at_port) for driver, at_port in zip(drivers, heard, strict=True)]
+    for driver in (driver for driver in config.driver if driver.kind == CAN):
+        at_bus = listen_to_bus(driver.address, LISTEN_S, all_signals(driver.signals, driver.dbc))
+        # What it lacks of a whole machine may be fed from elsewhere.
+        findings.append(check_receiver(driver, replace(at_bus, problem="") if at_bus.kind else at_bus))
     findings += [check_origin(site, at_port.place) for at_port in heard if at_port.place][:1]
     for address in set(config.corrections.ports) - {driver.address for driver in config.driver}:
         try:
@@ -78,7 +85,7 @@ def _receivers(site: SiteConfig, config: AgentConfig) -> list[Finding]:
 def check_sensors(machine: MachineConfig, config: AgentConfig) -> list[Finding]:
     """Whether each sensor is fed and plausibly mounted."""
     fed = {name for driver in config.driver for name in driver.feeds.values()}
-    are_ours = bool(config.driver) and all(driver.kind in DECODERS for driver in config.driver)
+    are_ours = bool(config.driver) and all(driver.kind in (*DECODERS, CAN) for driver in config.driver)
     findings = []
     for sensor in machine.sensors:
         if are_ours and sensor.use and sensor.name not in fed:

@@ -15,6 +15,7 @@ log = logging.getLogger("agents.drivers")
 
 RETRY_NS = 10**9  # between two tries to open
 SILENT = "the bus is silent: is the ignition on, the cable in, the bit rate right?"
+OFF = "bus off, the adapter left it after errors: check bit rate and wiring, and set `restart-ms 100`"
 TOGETHER = 500  # frames of a recording that are handed on at once
 
 
@@ -83,7 +84,7 @@ class CanSource:
         if has_frames:
             self._heard_ns = self._clock_ns()
         if bus.is_off:
-            self._tell("bus off, the adapter left it after errors: check bit rate and wiring, and set `restart-ms 100`")
+            self._tell(OFF)
         elif has_frames:
             self._tell("")
         elif self._clock_ns() - self._heard_ns > SILENT_NS:

@@ -57,7 +57,7 @@ STREAMS = {
     "brake_switch": CanStream("brake", ("brake_switch",), lambda h: (h["brake_switch"],)),
     "brake_pedal": CanStream("brake", ("brake_pedal",), lambda h: (h["brake_pedal"],)),
     "ebs_switch": CanStream("brake", ("ebs_switch",), lambda h: (h["ebs_switch"],)),
-    "retarder": CanStream("brake", ("retarder_torque",), lambda h: (min(max(-h["retarder_torque"], 0.0), 1.0),)),
+    "retarder": CanStream("retarder", ("retarder_torque",), lambda h: (max(-h["retarder_torque"], 0.0),)),
     "cargo": CanStream("payload", ("cargo_mass",), lambda h: (h["cargo_mass"],)),
     "axles": CanStream("payload", ("axle_load",), lambda h: (h["axle_load"],)),
     "turn_rate": CanStream("odometry", ("turn_rate",), lambda h: (0.0, 0.0, h["turn_rate"])),

@@ -40,7 +40,7 @@ SENSORS = {
     "brake_switch": SensorConfig("brake", "brake"),
     "brake_pedal": SensorConfig("pedal", "brake"),
     "ebs_switch": SensorConfig("ebs", "brake"),
-    "retarder": SensorConfig("retarder", "brake"),
+    "retarder": SensorConfig("retarder", "retarder"),
     "cargo": SensorConfig("cargo", "payload"),
     "turn_rate": SensorConfig("turns", "odometry", measures=("rate",)),
     "fix": SensorConfig("gps-1", "gps", std={"position": 2.0}),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from agents.estimation import powertrain
-from agents.estimation.powertrain import DriveReadings, engine_drive, gear_ratio, motor_force, power_drive
+from agents.estimation.powertrain import RETARDER_STD, DriveReadings, engine_drive, gear_ratio, motor_force, power_drive
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.powertrain_config import PowertrainConfig
 from protocol.machine.readings import (
@@ -19,6 +19,7 @@ from protocol.machine.readings import (
     Motor,
     MotorPower,
     Reading,
+    Retarder,
     Torque,
 )
 from tests.unit.agents.drives import Ground, Leg, drive, machine
@@ -40,7 +41,7 @@ SENSORS = SensorConfig("engine", "engine"), SensorConfig("gearbox", "driveline")
 def test_engine_torque_less_losses_arrives_by_gear_final_drive_and_efficiency() -> None:
     drive = engine_drive(TRAIN, 0.4, SECOND_RADPS, 2.0, RADIUS_M)
     assert drive.force_n == pytest.approx(0.4 * 2000 * 3 * 8 * 0.9 / 0.75)  # 23 040 N
-    assert drive.variance_n2 == pytest.approx((0.01 * 2000 * 24 / 0.75) ** 2 / 12)
+    assert drive.variance_n2 == pytest.approx(2 * (0.01 * 2000 * 24 / 0.75) ** 2 / 12), "steps of torque and losses"
     assert drive.unknown == ""
 
 
@@ -76,10 +77,14 @@ def test_a_motor_drives_by_its_ratio_or_by_power_over_speed() -> None:
     assert power_drive(electric, 60_000.0, 0.4).unknown == "creeps"
 
 
-def taken(*readings: Reading, train: PowertrainConfig = TRAIN) -> powertrain.Drive:
+def collected_by(train: PowertrainConfig, readings: Sequence[Reading]) -> DriveReadings:
     collected = DriveReadings(MachineConfig("m", wheel_radius_m=RADIUS_M, powertrain=train))
     assert all(map(collected.add, readings))
-    return collected.take(2.0)
+    return collected
+
+
+def taken(*readings: Reading, train: PowertrainConfig = TRAIN) -> powertrain.Drive:
+    return collected_by(train, readings).take(2.0)
 
 
 ENGINE = Engine("engine", 10**9, 0.5, SECOND_RADPS)
@@ -97,6 +102,9 @@ LOADER = replace(TRAIN, idle_pressure_pa=3e6)
         (EngineLosses("l", 10**9, 0.1), LOADER, "hydraulics"),  # pressure unknown
         (HydraulicPressure("h", 10**9, 2e7), LOADER, "hydraulics"),
         (HydraulicPressure("h", 10**9, 2e6), LOADER, ""),
+        (Retarder("r", 10**9, 0.01), TRAIN, "braking"),  # nobody says how much that is
+        (Retarder("r", 10**9, 0.0), TRAIN, ""),
+        (Retarder("r", 10**9, 0.4), replace(TRAIN, retarder_torque_nm=1500.0), ""),
     ],
 )
 def test_a_force_that_is_not_known_has_a_reason(beside: Reading, train: PowertrainConfig, unknown: str) -> None:
@@ -107,6 +115,20 @@ def test_losses_that_are_read_count_in_place_of_those_stated_and_not_once_they_f
     stated, read = taken(ENGINE), taken(EngineLosses("l", 10**9, 0.2), ENGINE)
     assert read.force_n == pytest.approx(stated.force_n * 0.3 / 0.4)
     assert taken(EngineLosses("l", 1, 0.2), replace(ENGINE, stamp_ns=3 * 10**9)) == stated
+
+
+@pytest.mark.parametrize("speed_mps", [2.0, -2.0])
+def test_a_retarder_brakes_by_the_final_drive_and_leaves_doubt_in_proportion(speed_mps: float) -> None:
+    train, retarder = replace(TRAIN, retarder_torque_nm=1500.0), Retarder("r", 10**9, 0.4)
+    radps = SECOND_RADPS if speed_mps > 0 else 40.0 * 2.0 / RADIUS_M
+    own, without = (
+        collected_by(train, (*more, replace(ENGINE, speed_radps=radps))).take(speed_mps) for more in ((retarder,), ())
+    )
+    force_n = 0.4 * 1500 * 8 / 0.75  # 6400 N, whatever the gear
+    assert without.force_n - own.force_n == pytest.approx(math.copysign(force_n, speed_mps))
+    assert own.variance_n2 - without.variance_n2 == pytest.approx(
+        (RETARDER_STD * force_n) ** 2 + (0.01 * force_n / 0.4) ** 2 / 12
+    )
 
 
 def test_torque_at_the_wheels_counts_before_what_a_motor_or_engine_states() -> None:

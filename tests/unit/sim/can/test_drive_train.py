@@ -10,7 +10,7 @@ import pytest
 
 from agents.drivers.can.pgns import SIGNALS
 from agents.drivers.can.signals import frame_of
-from agents.estimation.powertrain import engine_drive
+from agents.estimation.powertrain import engine_drive, retarded
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from protocol.machine.readings import Brake, Driveline, Engine, EngineLosses, FuelRate, HydraulicPressure, Odometry
@@ -53,13 +53,15 @@ def test_an_agent_computes_the_force_at_the_wheels_back(model: str, speed_mps: f
     assert drive.force_n == pytest.approx(force_n, rel=1e-9)
 
 
-def test_an_engine_brakes_by_its_losses_first_then_the_retarder_then_the_brakes() -> None:
+def test_an_engine_brakes_by_its_losses_first_then_the_retarder_whose_force_an_agent_computes_then_the_brakes() -> None:
     train, radps = train_of("dump_truck"), 8.0 / 0.9
     gentle, firm, hard = (steady(train, radps, -nm) for nm in (2e3, 30e3, 150e3))
     assert [known.retarder[-1] for known in (gentle, hard)] == [0.0, 1.0]
     assert 0 < firm.retarder[-1] < 1
     assert [bool(known.braked[-1]) for known in (gentle, firm, hard)] == [False, False, True]
     assert gentle.torque[-1] > firm.torque[-1] == 0.0 == firm.litres_ph[-1]
+    drag = engine_drive(train.data_sheet, -float(firm.losses[-1]), float(firm.engine_radps[-1]), 8.0, 0.9)
+    assert retarded(train.data_sheet, drag, float(firm.retarder[-1]), 8.0, 0.9).force_n == pytest.approx(-30e3 / 0.9)
 
 
 def test_gears_rise_with_speed_and_a_machine_that_stands_idles_with_an_open_converter() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import socket
 import sys
@@ -21,6 +22,7 @@ from sitegrid.setup import files
 from sitegrid.setup.files import Folder, models
 from sitegrid.setup.hearing import HeardLine
 from tests.unit.agents.drivers.frames import TPV, pvt, report, ubx
+from tests.unit.agents.drivers.test_can import EEC1, frame
 from tests.unit.sitegrid.setup.test_listening import IMU, INDOORS
 
 GNSS = ("fix", "velocity")
@@ -187,6 +189,49 @@ def test_the_doctor_says_what_a_receiver_does_that_worked_before(
     recording.write_bytes(sent)
     findings = [finding for finding in examine_folder(tmp_path / "quarry") if sentence in str(finding)]
     assert [finding.level for finding in findings] == [level]
+
+
+ON_BUS = """
+[machine.powertrain]
+reference_torque_nm = 2300.0
+[[sensor]]
+name = "engine"
+kind = "engine"
+[[sensor]]
+name = "load"
+kind = "payload"
+[[driver]]
+kind = "can"
+address = {address}
+feeds = {{ engine = "engine", load = "load" }}
+[driver.signals.load]
+pgn = 65300
+start = 0
+bits = 8
+"""
+LOAD = (3 << 26 | 65300 << 8, b"\x20")
+
+
+@pytest.mark.parametrize(
+    ("sent", "level", "sentence"),
+    [
+        ((EEC1, LOAD), Level.PASS, "can feeds engine, load"),
+        ((frame(61444), LOAD), Level.WARN, "nothing comes for engine; switch its messages on"),
+        ((frame(64000),), Level.FAIL, "1 frames, and none that the built-in table knows"),
+        ((), Level.FAIL, "the bus is silent: is the ignition on"),
+    ],
+)
+def test_the_doctor_listens_to_a_bus_with_the_signals_of_its_driver(
+    tmp_path: Path, recording: Path, sent: Sequence[tuple[int, bytes]], level: Level, sentence: str
+) -> None:
+    assert init(tmp_path, "--port", recording, *MODEL) == 0
+    bus = tmp_path / "bus.log"
+    bus.write_text("".join(f"(1795688127.0) can0 {identifier:08X}#{data.hex()}\n" for identifier, data in sent))
+    with (tmp_path / "quarry" / "agent.toml").open("a", encoding="utf-8") as agent:
+        agent.write(ON_BUS.format(address=json.dumps(str(bus))))
+    found = [finding for finding in examine_folder(tmp_path / "quarry") if str(bus) in str(finding)]
+    assert [finding.level for finding in found] == [level]
+    assert sentence in str(found[0])
 
 
 def test_the_doctor_looks_at_data_and_ports_and_leaves_a_running_agent_its_receivers(
