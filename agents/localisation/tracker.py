@@ -201,7 +201,7 @@ class Tracker:
         measurement, layout = aid.measurement(fusion.belief), fusion.model.layout
         beliefs = fusion.add([measurement]) if measurement else []
         if beliefs and not aid.judge(fusion.belief, fusion.last[LANES].nis, layout):
-            self._doubt = partial(aid.forgotten, layout=layout)
+            self._doubt = partial(aid.taken_back, layout=layout)
         return beliefs
 
     def _place(self, fusion: Fusion, event: Fix | Measurement) -> list[Belief]:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from agents.localisation.lanes.lane_map import LaneMap
-from lab.fedback.days import free_ways
+from lab.fedback.days import SITES, free_ways
 from lab.fedback.rerun import Maps
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import FoldConfig
@@ -121,6 +121,12 @@ class Scene:
         lanes = lane_map(rows)
         return lambda _: lambda __: lanes
 
+    def elsewhere(self) -> MapsOf:
+        """Of machines on other routes alone: routes take turns with the machines' numbers."""
+        route = {name: int(name.rpartition("-")[2]) % len(SITES["driven"].routes) for name, _ in self.rows}
+        lanes = {own: lane_map([(n, rows) for n, rows in self.rows if route[n] != own]) for own in set(route.values())}
+        return lambda name: lambda _: lanes[route[name]]
+
     def moves(self, left_m: float) -> MapsOf:
         """The eastern roads seem displaced from half time on."""
         before, after = lane_map(self.rows), lane_map(moved(self.rows, left_m, from_x_m=EAST_M))
@@ -152,6 +158,7 @@ GROWING = ("young", "alone")  # maps of the same day
 _draw = partial(np.random.default_rng, 7)
 MAPS: dict[str, Callable[[Scene], MapsOf]] = {
     "mature": lambda scene: scene.still(scene.rows),
+    "others": lambda scene: scene.elsewhere(),
     "young": lambda scene: scene.grows(lambda _: [name for name, _ in scene.own]),
     "alone": lambda scene: scene.grows(lambda name: [name]),
     "east2": lambda scene: scene.still(moved(scene.rows, east_m=2.0)),

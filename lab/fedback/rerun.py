@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.dead_reckoning import DeadReckonedPose
+from agents.localisation.filters.belief import FREED
 from agents.localisation.filters.motion import BESIDE_S, BESIDE_STD_M, OFFSET_WALK
 from agents.localisation.filters.smoother import KEPT
 from agents.localisation.filters.state import YAW
-from agents.localisation.lanes.guards import OFF_NS, Guards, prior_m2, share_of, shown
+from agents.localisation.lanes.guards import Guards, prior_m2, share_of, shown
 from agents.localisation.lanes.lane_map import LaneMap
 from agents.localisation.lanes.matching import Match, match
 from agents.localisation.lanes.window import Window
@@ -44,10 +45,10 @@ class _Smoother:
     """Nodes in the lag and the state, jointly: mean (q, 3), covariance (q, 3, 3), cross-covariance (q, 3, s)."""
 
     def __init__(self, states: int, offset_m2: float) -> None:
-        """offset_m2: prior variance of the map's offset, 0: not a state; held: least share of positions."""
+        """offset_m2: prior variance of the map's offset, 0: not a state."""
         self.mean, self.P, self.C = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, states))
         self.final: list[tuple[Floats, Floats, float]] = []
-        self.offset_m2, self.held = offset_m2, 0.0
+        self.offset_m2 = offset_m2
 
     def add(self, mean: Floats, P: Floats) -> None:
         if len(self.mean) == LAG:
@@ -70,7 +71,7 @@ class _Smoother:
         return np.array(means)[:, :2], np.array(covariances)[:, :2, :2], np.array(aided)
 
     def _share(self, cross: Floats) -> float:
-        return max(share_of(cross[:2, -3:-1], self.offset_m2), self.held) if self.offset_m2 else 0.0
+        return share_of(cross[:2, -3:-1], self.offset_m2) if self.offset_m2 else 0.0
 
 
 def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -> Course:
@@ -84,7 +85,7 @@ def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -
         P[n:, n:] = np.diag(prior_m2(young=young))
     offset_m2 = float(prior_m2(young=young)[0]) * aids
     smoother, live, live_m2, seen, at = _Smoother(states, offset_m2), [], [], [], 0
-    holds_ns, proven_ns = 0, int(nodes.stamp_ns[0]) + round(PROVEN_S * 1e9)
+    proven_ns = int(nodes.stamp_ns[0]) + round(PROVEN_S * 1e9)
     for k, stamp_ns in enumerate(nodes.stamp_ns.tolist()):
         if k:
             d, P = _moved(nodes, k - 1, d, P, smoother)
@@ -107,11 +108,10 @@ def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -
                 seen.append(d[n:].copy())
                 if why := guards.judge(stamp_ns, d[n:], prior_m2(young=young), nis):
                     counts[why] += 1
-                    smoother.held, holds_ns = share_of(P[:2, n : n + 2], offset_m2), stamp_ns + OFF_NS
+                    d, P = _freed(d, P, n, prior_m2(young=young), smoother)
                     d[n:], P[n:, :], P[:, n:] = 0.0, 0.0, 0.0
                     P[n:, n:] = np.diag(prior_m2(young=young))
                     smoother.C[:, :, n:] = 0.0
-        smoother.held *= stamp_ns < holds_ns
         x = nodes.x[k] + d[:n]
         live.append(x[:2])
         live_m2.append(P[:2, :2].copy())
@@ -137,6 +137,16 @@ def _reckoned(nodes: Nodes, stamp_ns: int) -> DeadReckonedPose:
     """Dead reckoning at a stamp."""
     x_m, y_m, angle_rad = (float(np.interp(stamp_ns, nodes.way_ns, nodes.way[:, i])) for i in range(3))
     return DeadReckonedPose(stamp_ns, 0.0, angle_rad, x_m, y_m)
+
+
+def _freed(d: Floats, P: Floats, n: int, prior_m2: Floats, smoother: _Smoother) -> tuple[Floats, Floats]:
+    """As `freed` of beliefs does: the states from n on had been assumed with these variances (3,)."""
+    of_guards, H = P[n:], np.eye(len(d))[n:]
+    S = of_guards[:, n:] - np.diag(np.maximum(prior_m2, of_guards[:, n:].diagonal()) / (1 - 1 / FREED))
+    gain = np.linalg.solve(S, H)
+    K = P @ gain.T
+    smoother.inform(-gain.T @ d[n:], H.T @ gain, np.eye(len(d)) - K @ H)
+    return d - K @ d[n:], P - K @ of_guards
 
 
 def _matched(

@@ -15,6 +15,8 @@ from agents.localisation.filters.state import SPEED, YAW, X, Y
 from protocol.arrays import Floats
 from protocol.rotations import wrap_angle
 
+FREED = 10.0  # factor on prior variances: hardly anything is assumed then
+
 
 @dataclass(frozen=True, slots=True)
 class Belief:
@@ -143,8 +145,8 @@ def extended(belief: Belief, variance: Floats) -> Belief:
     return Belief(belief.stamp_ns, np.pad(belief.x, (0, more)), P, past=past)
 
 
-def reset_states(belief: Belief, states: slice, variance: float) -> Belief:
-    """Set states to zero with this variance, uncorrelated."""
+def reset_states(belief: Belief, states: slice, variance: float | Floats) -> Belief:
+    """Set states (k,) to zero with this variance, or one each, uncorrelated."""
     x, P, M = belief.x.copy(), belief.P.copy(), np.eye(len(belief.x))
     x[states], P[states, :], P[:, states], M[states] = 0.0, 0.0, 0.0, 0.0
     P[states, states] = np.eye(states.stop - states.start) * variance
@@ -173,6 +175,21 @@ def open_states(belief: Belief, states: slice, covariance: Floats) -> Belief:
     P = belief.P.copy()
     P[states, states] += covariance
     return Belief(belief.stamp_ns, belief.x, P, past=belief.past)
+
+
+def freed(belief: Belief, states: slice, variance: Floats) -> Belief:
+    """Widen the prior of states (k,), zero with variances (k,), by FREED afterwards, as if it had been so at first.
+
+    A prior is a measurement of zero, and a measurement with negative information takes most of it back. The covariance
+    stays definite, since a posterior is never wider than its prior.
+    """
+    seen, y, past = belief.P[states], -belief.x[states], belief.past
+    S = seen[:, states] - np.diag(np.maximum(variance, seen[:, states].diagonal()) / (1 - 1 / FREED))
+    K = np.linalg.solve(S, seen).T
+    if past is not None:
+        shown = past.transition[states]
+        past = past.informed(shown, np.linalg.solve(S, shown).T, y, K)
+    return Belief(belief.stamp_ns, belief.x + K.dot(y), belief.P - K.dot(seen), past=past)
 
 
 def restate_states(belief: Belief, states: slice, before: float, after: float) -> Belief:

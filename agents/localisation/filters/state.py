@@ -79,6 +79,11 @@ class Layout:
         first = self.map_offset.stop
         return slice(first, first + self.lanes)
 
+    @cached_property
+    def lane_guards(self) -> slice:
+        """Both: the offset, and how far beside."""
+        return slice(self.map_offset.start, self.beside_lane.stop)
+
     def gyro_bias(self, imu: int) -> int:
         """State of one yaw gyro's bias."""
         if not 0 <= imu < self.imus:

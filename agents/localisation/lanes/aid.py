@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from agents.dead_reckoning import DeadReckonedPose
-from agents.localisation.filters.belief import Belief, Measurement, reset_states
+from agents.localisation.filters.belief import Belief, Measurement, freed, reset_states
 from agents.localisation.filters.state import YAW, Layout, X, Y
 from agents.localisation.lanes.guards import ALARMS, Guards, prior_m2, share_of, shown
 from agents.localisation.lanes.lane_map import LaneMap
@@ -33,7 +33,6 @@ class LaneAid:
     def restart(self) -> None:
         """Begin anew, as localisation does."""
         self._window, self._guards, self._prior_m2 = Window(self._load_centre_m), Guards(), prior_m2(young=False)
-        self._held = 0.0  # share of places that holds since an alarm, when what is known of m is forgotten
 
     def is_due(self, reckoned: DeadReckonedPose) -> bool:
         """Note where dead reckoning is; returns whether a window has ended there."""
@@ -51,7 +50,6 @@ class LaneAid:
         self._is_used = False
         if self.lanes is None or not self._guards.is_open(belief.stamp_ns):
             return None
-        self._held = 0.0
         H = shown(len(belief.x), heading_rad)
         lanes = self.lanes.of_others(belief.stamp_ns)
         matched = match(lanes, H.dot(belief.x), H.dot(belief.P).dot(H.T), back_m, headings_rad)
@@ -63,22 +61,20 @@ class LaneAid:
 
     def judge(self, belief: Belief, nis: float, layout: Layout) -> bool:
         """Look at the belief after a measurement; returns whether lanes fit. Where not they are off for a while."""
-        guards = slice(layout.map_offset.start, layout.beside_lane.stop)
         self._std_m = math.sqrt(float(np.linalg.eigvalsh(belief.P[X : Y + 1, X : Y + 1])[-1]))
-        alarm = self._guards.judge(belief.stamp_ns, belief.x[guards], self._prior_m2, nis)
+        alarm = self._guards.judge(belief.stamp_ns, belief.x[layout.lane_guards], self._prior_m2, nis)
         self.counters[f"{LANES}_{alarm}"] += bool(alarm)
         self._is_used = not alarm
-        self._held = self.share(belief.P[:2, layout.map_offset]) if alarm else 0.0
         return not alarm
 
     def share(self, cross_m2: Floats) -> float:
         """How much of a place came from lanes, by its covariance with the map's offset (2, 2)."""
-        return max(share_of(cross_m2, float(self._prior_m2[0])), self._held)
+        return share_of(cross_m2, float(self._prior_m2[0]))
 
-    def forgotten(self, belief: Belief, layout: Layout) -> Belief:
-        """The belief with nothing known of the map's offset and of the machine's habit."""
-        offset_m2, _, beside_m2 = self._prior_m2.tolist()
-        return reset_states(reset_states(belief, layout.map_offset, offset_m2), layout.beside_lane, beside_m2)
+    def taken_back(self, belief: Belief, layout: Layout) -> Belief:
+        """The belief without what lanes said of the place, and with nothing known of the states that guard it."""
+        guards = layout.lane_guards
+        return reset_states(freed(belief, guards, self._prior_m2), guards, self._prior_m2)
 
     def report(self) -> dict[str, Any]:
         """Whether lanes are used, in plain values and a sentence."""

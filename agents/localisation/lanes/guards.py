@@ -2,7 +2,8 @@
 
 m: the map's offset, east and north. l: how far to the left of the fleet's lanes this machine keeps, a Gauss-Markov
 process, as drivers and roads differ. A match measures p + m + l n, n to the left of the heading. Fixes, which know
-nothing of m and l, tell these from the place in the long run, and bends tell l at once.
+nothing of m and l, tell these from the place in the long run, and bends tell l at once. After an alarm the place is
+what it would be if hardly anything had been assumed of m and l (`freed`): lanes pull it no longer.
 """
 
 from __future__ import annotations

@@ -9,7 +9,8 @@ the window, by dead reckoning. On a grid of shifts s, which reaches over GRID_SI
 B_j: metres that the fleet drove in the direction that the machine has at j. Ground that nobody drove is flat by the
 floor, and one pass is weak. In units u = L^-1 s, w has mean mu and covariance V over that of the grid without lanes.
 Along an eigenvector e of value v, what turns the prior into w is a measurement of variance v / (1 - v) at
-mu e / (1 - v).
+mu e / (1 - v). A measurement moves the mean by sqrt(1 - v) as a rule. Where w rises steadily, as where lanes begin, mu
+is far more, and v about 1: no more than FAR_SIGMA of that counts.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ SHARPNESS = 6.0  # as if so many places of a window knew of each other's error n
 FLOOR, FLOOR_M = 0.1, 1.0
 MAP_STD_M = 1.0  # what lanes are off within a window: drivers wander, and the map's own places err
 FLAT = 0.98  # a window that leaves more of the variance in every direction tells nothing
-FAR_SIGMA = 3.0  # lanes so far away are others
+FAR_SIGMA = 3.0  # lanes so far away are others; along one direction, of what a window may move the place by
 LEAST_SHARE, MOST_SHARE = 0.01, 0.999  # of the variance that is left along an eigenvector
 
 
@@ -61,9 +62,10 @@ def match(lanes: LaneMap, place_m: Floats, P: Floats, back_m: Floats, heading_ra
     if values[0] > FLAT:
         return "flat"
     left = np.clip(values, LEAST_SHARE, MOST_SHARE)
+    most = FAR_SIGMA * np.sqrt(1 - left)
     along = L @ vectors  # (2, 2), a column for each eigenvector
     variance = left / (1 - left) + MAP_STD_M**2 / (along**2).sum(axis=0)
-    return Match(place_m + along @ (vectors.T @ mean / (1 - left)), (along * variance) @ along.T)
+    return Match(place_m + along @ (np.clip(vectors.T @ mean, -most, most) / (1 - left)), (along * variance) @ along.T)
 
 
 def _driven(lanes: LaneMap, centre: Floats, heading_rad: Floats, reach: Floats) -> Floats:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from agents.dead_reckoning import DeadReckonedPose
-from agents.localisation.filters.belief import Belief, Measurement, extended
+from agents.localisation.filters.belief import FREED, Belief, Measurement, Motion, extended, freed
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import BESIDE_STD_M, MotionModel
@@ -17,7 +17,7 @@ from agents.localisation.filters.ukf import Ukf
 from agents.localisation.lanes.aid import LANES, LaneAid
 from agents.localisation.lanes.guards import AFTER_NS, OFF_NS, Guards, prior_m2, share_of, shown
 from agents.localisation.lanes.lane_map import LaneMap
-from agents.localisation.lanes.matching import Match, match
+from agents.localisation.lanes.matching import FAR_SIGMA, Match, match
 from agents.localisation.lanes.window import WINDOW_M, Window
 from protocol.queries.lanes import SCALE_M, LaneTile
 
@@ -75,6 +75,20 @@ def test_a_lane_shows_how_far_beside_it_the_machine_seems_to_be(off_m):
     assert matched.place_m[0] == pytest.approx(0.0, abs=0.25)
     assert 1.0 < matched.covariance_m2[0, 0] < 2.0
     assert matched.covariance_m2[1, 1] > 1000  # nothing observable along a straight
+
+
+@pytest.mark.parametrize("begins_m", [-12, -8, -4, 0])
+@pytest.mark.parametrize("P", [np.diag([4.0, 4.0]), np.array([[4.0, 1.0], [1.0, 3.0]])])
+def test_a_window_moves_the_place_by_no_more_than_it_tells(begins_m, P):
+    """Where lanes begin likelihood rises steadily: that moves the mean, and hardly narrows it."""
+    metres = np.zeros((16, 128, 128))
+    metres[4, 64 + begins_m :, 63:65] = 10.0
+    for off_m in (0.0, 2.0):
+        place_m = np.array([off_m, 0.0])
+        matched = match(lane_map(metres), place_m, P, *straight())
+        assert isinstance(matched, Match)
+        y = matched.place_m - place_m
+        assert y @ np.linalg.solve(P + matched.covariance_m2, y) < 2 * FAR_SIGMA**2
 
 
 def test_lanes_that_one_machine_drew_today_are_left_out():
@@ -166,17 +180,43 @@ def test_the_share_of_lanes_is_how_far_places_go_with_the_map(engine):
     np.testing.assert_allclose(np.linalg.norm(np.stack(went, axis=2), 2, axis=(1, 2)), shares, atol=2e-3)
 
 
-def test_after_an_alarm_places_keep_the_share_that_they_had():
-    aid, belief = LaneAid(0.0), belief_at()
-    belief.P[0, -3] = belief.P[-3, 0] = -0.4
-    assert aid.share(belief.P[:2, LAYOUT.map_offset]) == pytest.approx(0.4)
-    x = belief.x.copy()
-    x[-3] = 2.1
-    assert not aid.judge(Belief(10**9, x, belief.P), 1.0, LAYOUT)
-    forgotten = aid.forgotten(belief, LAYOUT)
-    assert aid.share(forgotten.P[:2, LAYOUT.map_offset]) == pytest.approx(0.4)
-    aid.restart()
-    assert aid.share(forgotten.P[:2, LAYOUT.map_offset]) == 0.0
+@pytest.mark.parametrize("engine", [Ekf(), Ukf()])
+def test_after_an_alarm_places_are_as_if_next_to_nothing_had_been_assumed_of_the_map(engine):
+    """Live, and of each place of the past: what lanes 3 m elsewhere said of the place is taken back."""
+    aid, n = LaneAid(0.0), LAYOUT.n
+
+    def driven(times):
+        """As the guards were assumed, or so many times as wide."""
+        belief = belief_at()
+        belief.P[-3:, -3:] *= times
+        for second in range(1, 30):
+            stays = Motion(lambda x: x, lambda _: np.eye(n), np.diag(np.r_[np.full(n - 3, 1e-3), np.zeros(3)]), ())
+            belief = engine.predict(belief, stays, second * 10**9)
+            H = shown(n, 0.1 * second)
+            if second % 10 == 0:
+                H[:, -3:] = 0.0  # a fix
+            z = np.zeros(2) if second % 10 == 0 else np.array([3.0, 1.0])
+            seen = Measurement("place", belief.stamp_ns, z, np.eye(2), lambda x, H=H: x @ H.T, lambda _, H=H: H)
+            belief = engine.condition(belief, seen).belief
+        return belief
+
+    def places(belief):
+        poses = belief.past.poses(belief.stamp_ns, belief.x, belief.P)
+        return [(*(pose.x_m, pose.y_m), *pose.covariance_m2.ravel(), *pose.cross.ravel()) for pose in poses]
+
+    assumed, wide = driven(1.0), driven(FREED)
+    assert aid.share(assumed.P[:2, LAYOUT.map_offset]) > 0.2
+    assert abs(places(assumed)[-1][0] - places(wide)[-1][0]) > 0.2
+    undone = freed(assumed, LAYOUT.lane_guards, prior_m2(young=False))
+    np.testing.assert_allclose(undone.x, wide.x, atol=1e-6)
+    np.testing.assert_allclose(undone.P, wide.P, atol=1e-6)
+    np.testing.assert_allclose(places(undone), places(wide), atol=1e-6)
+
+    assert not aid.judge(Belief(assumed.stamp_ns, assumed.x + 2.1 * np.eye(n)[-3], assumed.P), 1.0, LAYOUT)
+    taken = aid.taken_back(assumed, LAYOUT)
+    np.testing.assert_array_equal(taken.x[:-3], undone.x[:-3])
+    np.testing.assert_array_equal(taken.P[-3:, -3:], np.diag(prior_m2(young=False)))
+    assert aid.share(taken.P[:2, LAYOUT.map_offset]) == 0.0
 
 
 def test_alarms_turn_lanes_off_for_a_while():
