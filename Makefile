@@ -73,10 +73,13 @@ fuzz: venv
 soak: venv
 	$(BIN)/python -m tests.soak
 
-# A folder of wheels for hosts without a network (docs/operation.md): of this computer's kind and version of Python.
+# A folder of wheels for hosts without a network (docs/operation.md): of this computer's kind and version of Python. Its
+# requirements.txt has the hash of each.
+OF ?= agent,can,postgres,receivers,security,server,web
+WHEELS ?= wheels
 bundle:
-	"$(PYTHON)" -m pip wheel --quiet --disable-pip-version-check --constraint constraints.txt --wheel-dir wheels \
-		'.[agent,can,postgres,receivers,security,server,web]'
+	"$(PYTHON)" -m pip wheel --quiet --disable-pip-version-check --constraint constraints.txt --wheel-dir '$(WHEELS)' '.[$(OF)]'
+	cd '$(WHEELS)' && sha256sum *.whl | awk '{split($$2, part, "-"); print part[1] "==" part[2] " --hash=sha256:" $$1}' > requirements.txt
 
 bench: venv
 	$(BIN)/python -m lab speed merge

@@ -6,7 +6,7 @@ Callbacks only move bytes: one that works stalls the session.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import zenoh
@@ -175,12 +175,16 @@ class Server:
 
 
 def warm_up(config: ServerConfig) -> None:
-    """Load all kernels before the first batch and question."""
+    """Load the kernels of ingest and of a point before the first batch and question."""
     grid.warm_up(config.fold)
     batches.warm_up()
     block_credit.warm_up(config.fold)
     records.warm_up()
     change_log.warm_up(config.fold)
-    ledger.warm_up()
-    road_maps.warm_up(config.fold)
-    routes.warm_up()
+
+
+def warm_up_rest(config: ServerConfig) -> Iterator[None]:
+    """Load all other kernels, one part at each step: calibration, roads, routes."""
+    yield ledger.warm_up()
+    yield road_maps.warm_up(config.fold)
+    yield routes.warm_up()

@@ -23,7 +23,7 @@ from sitegrid.process.lifetime import raise_interrupts
 from tests.paths import ROOT
 
 FOLDER = ROOT / ".nightly"
-NIGHT_S = 45 * 60.0
+NIGHT_S = 60 * 60.0
 HANGS = 4  # budgets after which a part counts as hung
 TIDY_S = 60.0  # for an interrupted part to end its processes
 TESTS = ("pytest", "--quiet", "--numprocesses", "auto", "--dist", "worksteal", "--durations", "15")
@@ -31,6 +31,7 @@ COMPOSE = ("tests/integration/test_compose.py", "tests/integration/test_compose_
 FOLD = ("tests/integration/test_fold_jobs.py", "tests/unit/sitegrid/refold")
 TAKEOVER = ("tests/integration/test_takeover.py",)
 FOLLOWERS = ("tests/integration/test_followers.py",)
+RELEASE = ("tests/release",)
 SPEED = (
     "merge --runs 1 --samples 50000",
     "ingest --runs 1 --samples 5000",
@@ -44,7 +45,7 @@ SPEED = (
     "sim --runs 1 --seconds 5",
     "archive --samples 200000",
 )
-OTHERS = tuple(word for path in (*COMPOSE, *FOLD, *TAKEOVER, *FOLLOWERS) for word in ("--ignore", path))
+OTHERS = tuple(word for path in (*COMPOSE, *FOLD, *TAKEOVER, *FOLLOWERS, *RELEASE) for word in ("--ignore", path))
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ PARTS = (
     Part("worlds", 90, (("tests.delivery_simulation", "--seeds", "1000"), ("tests.fuzz", "--seconds", "30"))),
     Part("takeover", 180, ((*TESTS, *TAKEOVER), ("tests.takeover", "--count", "12"))),
     Part("compose", 180, ((*TESTS, *COMPOSE),)),
+    Part("release", 900, ((*TESTS[:2], *RELEASE),)),
     Part("fold", 140, ((*TESTS, "-m", "nightly", *FOLD),)),
     Part("followers", 120, ((*TESTS, *FOLLOWERS), *loads("followers --machines 20 --seconds 5 --hours 0.2 --runs 1"))),
     Part("lab", 300, ((*TESTS, "lab/tests"),)),

@@ -37,9 +37,15 @@ def make_or_check(db: sqlite3.Connection) -> None:
     if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
         for statement in _TABLES:
             db.execute(statement)
+    require_schema(db)
+
+
+def require_schema(db: sqlite3.Connection) -> None:
+    """ValueError for a file of another version, which says what to do."""
     (schema,) = db.execute("PRAGMA user_version").fetchone()
     if schema != SCHEMA:
-        raise ValueError(f"schema {schema}, this agent knows {SCHEMA}")
+        advice = "have the version that wrote it send its samples, or choose another --spool"
+        raise ValueError(f"schema {schema}, this version knows {SCHEMA}; {advice}")
 
 
 def run_ends_in(db: sqlite3.Connection) -> list[RunEnd]:

@@ -7,6 +7,7 @@ are metres in 1/4096 m, and saturate.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from protocol.site.geometry import BLOCK_CELLS
 SCHEMA = 6  # number of the format below; other snapshots are folded again
 
 CELLS = BLOCK_CELLS * BLOCK_CELLS  # cells per block
+ZERO: Any = np.int64(0)  # where kernels count from: Numba compiles a callee once more for a literal 0
 WEIGHT_UNITS_PER_M = 4096
 COUNT_MAX = np.iinfo(np.uint32).max
 

@@ -15,6 +15,7 @@ from mapserver.evidence import cells as ev
 
 _RESISTANCE, _EAST, _NORTH = ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start
 _HEADING, _DOUBT, _AIDED, _COUNTS, _CELLS = ev.HEADING.start, ev.DOUBT, ev.AIDED, ev.COUNTS, ev.CELLS
+_ZERO = ev.ZERO
 _ONE, _PLANE, _HALF_SHARE = np.uint64(1), np.uint64(ev.CELLS), np.uint32(ev.SHARE_ONE // 2)
 _NONE = np.uint32(0)
 
@@ -39,7 +40,7 @@ def fold_sorted(
     stencils, starts, shares, bins, bin_shares, bits, stamps = samples
     counts, lines, visits, machines, newest = scratch
     lane, last = np.empty(_CELLS, np.uint32), np.zeros(_CELLS, np.uint32)
-    pages, votes, cells, at = 0, 0, 0, first
+    pages, votes, cells, at = 0, _ZERO, _ZERO, first
     while (
         at < len(keys)
         and pages < len(out_pages)
@@ -50,7 +51,7 @@ def fold_sorted(
         left = ((key >> (BLOCK_BITS + BUCKET_BITS)) - HALF) << 4
         bottom = (((key >> BUCKET_BITS) & _BLOCK_MASK) - HALF) << 4
         low, high = 16, 0  # touched rows of cells
-        run_low, run_high = 16, 0  # of a run: one machine and minute, by stamp
+        run_low, run_high = _ZERO + 16, _ZERO  # of a run: one machine and minute, by stamp
         before = -1
         while at < len(keys) and keys[at] == key:
             k = touching[at]

@@ -20,7 +20,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from mapserver.evidence.cells import CELLS, COUNTS
+from mapserver.evidence.cells import CELLS, COUNTS, ZERO
 
 FIELDS = 6  # numbers in the header, before the bits
 HEADER_BYTES = FIELDS * 4 + CELLS // 8
@@ -98,7 +98,7 @@ def _words_of(words: Any, at: int) -> tuple[int, int, int, int]:
 
 @numba.njit(cache=True, nogil=True)
 def _read_cells(table: Any, marks: Any, words: Any, out: Any) -> None:
-    at = 0
+    at = ZERO
     for p in range(len(table)):
         visits, machines, stamps, at = _words_of(words, at)
         for j in range(table[p, 4], table[p, 5]):
@@ -111,8 +111,8 @@ def _read_cells(table: Any, marks: Any, words: Any, out: Any) -> None:
 @numba.njit(cache=True, nogil=True)
 def sum_planes(data: Any, first: int, out: Any) -> None:
     """Add votes of planes from `first` to out (planes, 256)."""
-    _, _, _, counts, high, places, runs = parts(data, 0)
-    at = np.int64(0)
+    _, _, _, counts, high, places, runs = parts(data, ZERO)
+    at = ZERO
     for r in range(len(runs)):
         plane, end = np.int64(runs[r, 0]) - first, at + np.int64(runs[r, 1]) + 1
         if 0 <= plane < len(out):
@@ -137,7 +137,7 @@ def ranks(table: Any) -> Any:
 @numba.njit(cache=True, nogil=True)
 def votes_in_time(data: Any, out: Any, ends: Any) -> None:
     """Votes of a record by pages in time, and the end of each page's (n,)."""
-    table, _, _, counts, high, places, runs = parts(data, 0)
+    table, _, _, counts, high, places, runs = parts(data, ZERO)
     rank, run, vote = ranks(table), 0, 0
     for p in range(len(table)):
         ends[rank[p]] = table[p, 3] - (table[p - 1, 3] if p else 0)
@@ -159,7 +159,7 @@ def sum_records(data: Any, begins: Any, start: Any, counts: Any, bitmaps: Any, n
     """
     for block in range(len(begins)):
         table, marks, words, low, high, places, runs = parts(data, begins[block])
-        rank, run, vote, word = ranks(table), 0, 0, 0
+        rank, run, vote, word = ranks(table), 0, 0, ZERO
         for p in range(len(table)):
             while run < table[p, 2]:
                 plane, end = np.uint64(runs[run, 0]), vote + int(runs[run, 1]) + 1

@@ -7,7 +7,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from mapserver.evidence.cells import CELLS
+from mapserver.evidence.cells import CELLS, ZERO
 from mapserver.evidence.fold_config import HASH
 from mapserver.evidence.record_kernels import FIELDS, HEADER_BYTES, MARK_BYTES, ROW_BYTES, WORD_BYTES
 
@@ -122,7 +122,7 @@ def _write_cells(table: Any, cells: Any, first: int, slots: Any, known: Any, mar
 @numba.njit(cache=True, nogil=True)
 def write_records(ends: Any, table: Any, votes: Any, cells: Any, out: Any, out_ends: Any) -> None:
     """One record for each block. ends, out_ends (b,): of its pages and its record."""
-    slots, first, at = new_slots(), 0, 0
+    slots, first, at = new_slots(), 0, ZERO
     for block in range(len(ends)):
         at = write_record(table[first : ends[block]], votes, cells, slots, out, at)
         out_ends[block], first = at, ends[block]

@@ -174,7 +174,7 @@ def weigh(rows: Any, places: Any, stencils: Any, starts: Any, shares: Any) -> No
     Fills shares with stencils (edge, edge) from starts (n,). Integer shares sum exactly to a weight; the middle takes
     the remainder.
     """
-    used = 0
+    used = ev.ZERO
     for k in range(len(rows)):
         starts[k] = used
         n = stencils[k, 2]

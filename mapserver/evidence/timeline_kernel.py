@@ -7,7 +7,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from mapserver.evidence.cells import CELLS, COUNT_MAX, COUNTS
+from mapserver.evidence.cells import CELLS, COUNT_MAX, COUNTS, ZERO
 from mapserver.evidence.record_kernels import read_record
 from mapserver.evidence.record_writing import new_slots, write_record
 
@@ -27,9 +27,9 @@ def settle_blocks(
     """
     before, after, tiers, counts = scratch
     table, votes, cells = before
-    slots, at, record = new_slots(), 0, 0
+    slots, at, record = new_slots(), ZERO, 0
     for block in range(len(ends)):
-        done = (0, 0, 0)
+        done = ZERO, ZERO, ZERO
         while record < ends[block]:
             done = read_record(data, starts[record], table, votes, cells, done)
             record += 1
@@ -42,11 +42,10 @@ def settle_blocks(
 def _settle(table: Any, votes: Any, cells: Any, spans: Any, keeps: Any, counts: Any, tiers: Any, after: Any) -> int:
     """Write a block's pages to `after`, by tier and index; returns their number."""
     out_table, out_votes, out_cells = after
-    pages, used, filled = 0, 0, 0
+    pages, used, filled = 0, ZERO, ZERO
     indices = _indices(table, spans)
     _find_tiers(table, indices, cells, keeps, tiers)
-    held = _held(table, tiers, len(spans))
-    spread = held.sum(axis=1) > 1  # pages with cells on several tiers
+    held, spread = _held(table, tiers, len(spans))
     wanted: Any = np.zeros(CELLS, np.bool_)
     planes = np.zeros(COUNTS, np.bool_)
     visits, machines, newest = np.zeros(CELLS, np.uint64), np.zeros(CELLS, np.uint64), np.zeros(CELLS, np.int64)
@@ -120,7 +119,7 @@ def _find_tiers(table: Any, indices: Any, cells: Any, keeps: Any, tiers: Any) ->
     kept, last = np.empty(CELLS, np.int64), np.empty(CELLS, np.int64)
     for tier in range(len(keeps) - 1):
         kept[:], last[:] = 0, -1
-        for p in np.argsort(-indices[:, tier]):
+        for p in _newest_first(indices, tier):
             index = indices[p, tier]
             if index < 0:
                 break
@@ -134,14 +133,34 @@ def _find_tiers(table: Any, indices: Any, cells: Any, keeps: Any, tiers: Any) ->
                         tiers[j] = tier + 1
 
 
+# Pages are few and mostly in order: insertion is quick, and numba's own sorts take seconds to compile.
+
+
+@numba.njit(cache=True, nogil=True)
+def _newest_first(indices: Any, tier: int) -> Any:
+    """Pages (n,) by falling index on a tier."""
+    order = np.empty(len(indices), np.int64)
+    for p in range(len(indices)):
+        at = p
+        while at and indices[order[at - 1], tier] < indices[p, tier]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = p
+    return order
+
+
 @numba.njit(cache=True, nogil=True)
 def _held(table: Any, tiers: Any, count: int) -> Any:
-    """Which tiers each page has cells on (n, count)."""
-    held = np.zeros((len(table), count), np.bool_)
+    """Which tiers each page has cells on (n, count), and whether on several (n,)."""
+    held, spread = np.zeros((len(table), count), np.bool_), np.zeros(len(table), np.bool_)
     for p in range(len(table)):
         for j in range(np.uint64(table[p, 4]), np.uint64(table[p, 5])):
             held[p, np.uint8(tiers[j])] = True
-    return held
+        on = 0
+        for tier in range(count):
+            on += held[p, tier]
+        spread[p] = on > 1
+    return held, spread
 
 
 @numba.njit(cache=True, nogil=True)
@@ -151,9 +170,15 @@ def _keys(indices: Any, held: Any) -> Any:
     for p in range(len(held)):
         for tier in range(held.shape[1]):
             if held[p, tier]:
-                keys[used] = (np.int64(tier) << _INDEX_BITS) | indices[p, tier]
-                used += 1
-    return np.unique(keys[:used])
+                key = (np.int64(tier) << _INDEX_BITS) | indices[p, tier]
+                at = used
+                while at and keys[at - 1] > key:
+                    at -= 1
+                if not at or keys[at - 1] != key:
+                    for later in range(used, at, -1):
+                        keys[later] = keys[later - 1]
+                    keys[at], used = key, used + 1
+    return keys[:used]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -13,6 +13,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from mapserver.evidence.cells import ZERO
 from mapserver.journal.rows import JournalRow, JournalRows
 from protocol.arrays import AnyArray, Bools, Ints, Table
 from protocol.machine.samples import SAMPLE_DTYPE
@@ -111,7 +112,7 @@ def _split(
     data: consecutive records, ending at ends (k,). Fills heads (k, bytes), lengths (k,) in samples, machine (k,) name
     numbers, firsts: first record of each name, samples (bytes). slots: -1, more than twice as many as records.
     """
-    begin, used, names = 0, 0, 0
+    begin, used, names = 0, 0, ZERO
     for k in range(len(ends)):
         for i in range(_HEAD_BYTES):
             heads[k, i] = data[begin + i]

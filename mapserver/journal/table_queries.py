@@ -151,12 +151,11 @@ class TableQueries(ABC):
 
     def _meta(self) -> dict[str, str]:
         """The table meta; StoreError for another schema, or damage."""
-        (schema,) = self._query("SELECT value FROM meta WHERE key = 'schema'") or [(None,)]
-        if schema != (str(self.schema),):
-            problem = f"has schema {schema[0]!r}, this version knows {self.schema}"
-            raise StoreError(
-                self.where, f"{problem}; open it with the version that wrote it, or choose another --store"
-            )
+        stated = dict(self._query("SELECT key, value FROM meta WHERE key IN ('schema', 'version')"))
+        if (schema := stated.get("schema")) != str(self.schema):
+            writer = f"sitegrid {stated['version']}" if "version" in stated else "the version"
+            problem = f"has schema {schema!r}, this version knows {self.schema}"
+            raise StoreError(self.where, f"{problem}; open it with {writer} that wrote it, or choose another --store")
         meta = {}
         for key, value, crc32 in self._query("SELECT key, value, crc32 FROM meta"):
             if crc32 != checksum(key, value):

@@ -24,6 +24,7 @@ from mapserver.journal.shortfall import KIND as SHORTFALL
 from mapserver.journal.shortfall import Shortfall
 from mapserver.journal.table_queries import TableQueries
 from protocol.errors import StoreError
+from protocol.version import package_version
 
 PlainEvent = tuple[str, int, Mapping[str, Any]]  # kind, stamp_ns, body
 Line = tuple[Any, ...]  # of a table
@@ -107,7 +108,7 @@ class TableWriter(TableQueries):
 def new_meta(schema: int, site: str, frame: str, descends: Iterable[str]) -> list[Line]:
     """Meta lines of a new journal. descends: ids of the stores it is made from."""
     store = " ".join((secrets.token_hex(8), *descends))
-    meta = {"schema": str(schema), "site": site, "frame": frame, "store": store}
+    meta = {"schema": str(schema), "version": package_version(), "site": site, "frame": frame, "store": store}
     return [meta_line(*each) for each in meta.items()]
 
 

@@ -86,7 +86,8 @@ def _smooth(points: Any, closed: bool, out: Any) -> None:  # noqa: FBT001
 
 @numba.njit(cache=True, nogil=True)
 def _is_cut(line: Any, i: int) -> bool:
-    column, row = np.floor(line[i] / LATTICE_M) != np.floor(line[i - 1] / LATTICE_M)
+    column = np.floor(line[i, 0] / LATTICE_M) != np.floor(line[i - 1, 0] / LATTICE_M)
+    row = np.floor(line[i, 1] / LATTICE_M) != np.floor(line[i - 1, 1] / LATTICE_M)
     return bool(column or row)
 
 
@@ -94,8 +95,10 @@ def _is_cut(line: Any, i: int) -> bool:
 def _begin_at_cut(line: Any) -> None:
     for start in range(1, len(line)):
         if _is_cut(line, start):
-            turned = np.concatenate((line[start:-1], line[: start + 1]))
-            line[:] = turned
+            before = line.copy()
+            for i in range(len(line)):
+                for axis in range(2):
+                    line[i, axis] = before[(start + i) % (len(line) - 1), axis]
             return
 
 
@@ -141,7 +144,8 @@ def gathered(points: Floats, first: Ints, last: Ints, back: Bools) -> tuple[Floa
     out, lengths = np.empty((ends[-1], 2)), np.zeros(len(first))
     for k in range(len(first)):
         for i in range(last[k] - first[k] + 1):
-            out[ends[k] + i] = points[last[k] - i] if back[k] else points[first[k] + i]
+            at = last[k] - i if back[k] else first[k] + i
+            out[ends[k] + i, 0], out[ends[k] + i, 1] = points[at, 0], points[at, 1]
             if i:
                 lengths[k] += _distance(out[ends[k] + i], out[ends[k] + i - 1])
     return out, ends, lengths

@@ -85,14 +85,19 @@ class Ledgers:
 
     def _placed(self, tally: Table, cell_m: float) -> tuple[Ints, Placed]:
         """Index (n,) of each row's cell and sector, and where these lie."""
-        which, numbers, sums = _places(tally)
+        which, numbers = _places(tally)
+        order = np.argsort(numbers)
+        rank = np.empty(len(order), np.int64)
+        rank[order] = np.arange(len(order))
+        which, numbers, sums = rank[which], numbers[order], np.zeros((len(order), 3), np.int64)
+        _sum_places(tally, which, sums)
         inside_m = sums[:, 1:] / (np.maximum(sums[:, :1], 1) * float(PER_M))
         return which, self.place(corner_m(numbers, cell_m) + inside_m, heading_rad(numbers))
 
 
 @numba.njit(cache=True, nogil=True)
-def _places(tally: Any) -> tuple[Any, Any, Any]:
-    """Index (n,) of each row's cell and sector, sorted numbers (u,) of these, sums (u, 3) of metres, x, y.
+def _places(tally: Any) -> tuple[Any, Any]:
+    """Index (n,) of each row's cell and sector, and the numbers (u,) of these as they come.
 
     A hash table, because a day's rows cover few places, unsorted.
     """
@@ -113,17 +118,17 @@ def _places(tally: Any) -> tuple[Any, Any, Any]:
             table[at], numbers[used] = used, number
             used += 1
         which[i] = table[at]
-    order = np.argsort(numbers[:used])
-    rank = np.empty(used, np.int64)
-    rank[order] = np.arange(used)
-    sums = np.zeros((used, 3), np.int64)
+    return which, numbers[:used]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_places(tally: Any, which: Any, sums: Any) -> None:
+    """Add metres, x and y of rows to those (u, 3) of their places."""
     for i in range(len(tally)):
-        row, which[i] = tally[i], rank[which[i]]
-        own = sums[which[i]]
-        own[0] += row.metres
-        own[1] += row.x
-        own[2] += row.y
-    return which, numbers[order], sums
+        row, at = tally[i], which[i]
+        sums[at, 0] += row.metres
+        sums[at, 1] += row.x
+        sums[at, 2] += row.y
 
 
 @numba.njit(cache=True, nogil=True)

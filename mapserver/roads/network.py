@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from mapserver.evidence.cells import WEIGHT_UNITS_PER_M
+from mapserver.evidence.cells import WEIGHT_UNITS_PER_M, ZERO
 from mapserver.roads.ridges import AXES
 from mapserver.roads.skeleton import Skeleton
 from protocol.arrays import AnyArray, Floats, Ints
@@ -82,9 +82,9 @@ def _superfluous(
                 gone[cells[at]] = True
         # undriven ends: the blur extends lines
         if loose_first:
-            _trim(along, cells, first, last, 1, gone)
+            _trim(along, cells, first, last, ZERO + 1, gone)
         if loose_last:
-            _trim(along, cells, first, last, -1, gone)
+            _trim(along, cells, first, last, ZERO - 1, gone)
     return gone
 
 
@@ -217,7 +217,7 @@ def _trace(links: Any, degree: Any, cells: Any, ends: Any) -> tuple[int, int]:
 @numba.njit(cache=True, nogil=True)
 def _trace_between(links: Any, degree: Any, seen: Any, cells: Any, ends: Any) -> tuple[int, int]:
     """Chains between ends and junctions; marks cells as seen."""
-    used, count = 0, 0
+    used, count = ZERO, 0
     for place in range(8 * len(links)):
         start, second = place // 8, links[place // 8, place % 8]
         if degree[start] == 2 or second < 0:
@@ -242,7 +242,7 @@ def _trace_rings(links: Any, degree: Any, seen: Any, cells: Any, ends: Any, used
     for start in range(len(links)):
         if seen[start]:
             continue
-        second = -1
+        second = ZERO - 1
         for k in range(7, -1, -1):
             if links[start, k] >= 0:
                 second = links[start, k]

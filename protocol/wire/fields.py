@@ -43,7 +43,9 @@ def unpack(data: bytes, limit: int, items: int = MAX_ITEMS) -> dict[str, Any]:
     if not isinstance(table, dict):
         raise MessageError(Refusal.NOT_MSGPACK, "not a MessagePack map")
     if (version := take(table, "v", int)) != VERSION:
-        raise MessageError(Refusal.VERSION, f"{version}: this side speaks version {VERSION}", field="v")
+        raise MessageError(
+            Refusal.VERSION, f"{version}: this side speaks version {VERSION}; update the older side", field="v"
+        )
     return table
 
 

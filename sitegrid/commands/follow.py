@@ -17,7 +17,7 @@ from protocol.wire.keys import check_name
 from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import return_large_blocks, stop_flag
-from sitegrid.process.progress import compilation_reported
+from sitegrid.process.progress import compilation_reported, done_beside
 from sitegrid.process.supervisor import say_ready, turns
 from sitegrid.security.join import join
 
@@ -42,7 +42,7 @@ def run(arguments: Namespace) -> int:
     from mapserver.config import ServerConfig
     from mapserver.follower.follower import Follower
     from mapserver.journal.location import JournalLocation
-    from mapserver.server import warm_up
+    from mapserver.server import warm_up, warm_up_rest
 
     stop = stop_flag()
     use_many_threads()
@@ -52,8 +52,9 @@ def run(arguments: Namespace) -> int:
     config = from_table(ServerConfig, table, str(arguments.config))
     name = check_name(arguments.name or _host(), "--name")
     with ExitStack() as opened:
-        with compilation_reported():
-            warm_up(config)
+        opened.enter_context(compilation_reported())
+        warm_up(config)
+        opened.enter_context(done_beside(warm_up_rest(config)))
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="follower", name=name, site=site.name)
         session = opened.enter_context(closing(open_session(joined)))
         journal = JournalLocation(arguments.store, arguments.journal)

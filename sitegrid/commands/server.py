@@ -19,7 +19,7 @@ from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
 from sitegrid.options.values import FOLDER, address
 from sitegrid.process.lifetime import end_in_time, return_large_blocks, stop_flag, tell
-from sitegrid.process.progress import compilation_reported
+from sitegrid.process.progress import compilation_reported, done_beside
 from sitegrid.process.supervisor import say_ready, turns, until
 from sitegrid.security.join import join, signer
 from sitegrid.security.register import load_register
@@ -60,7 +60,7 @@ def run(arguments: Namespace) -> int:
     """Serve until stopped; then finish pending batches, commit, snapshot."""
     from mapserver.config import ServerConfig
     from mapserver.journal.location import JournalLocation
-    from mapserver.server import Server, warm_up
+    from mapserver.server import Server, warm_up, warm_up_rest
 
     stop = stop_flag()
     use_many_threads()
@@ -69,8 +69,9 @@ def run(arguments: Namespace) -> int:
     table = load_toml(arguments.config) if arguments.config else {}
     config = from_table(ServerConfig, table, str(arguments.config))
     with ExitStack() as opened:
-        with compilation_reported():
-            warm_up(config)
+        opened.enter_context(compilation_reported())
+        warm_up(config)
+        opened.enter_context(done_beside(warm_up_rest(config)))
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name)
         ingest = opened.enter_context(closing(open_session(joined)))
         readers = opened.enter_context(closing(open_session(joined)))

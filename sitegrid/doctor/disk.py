@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
-from agents.delivery.spool_file import run_ends_in, runs_cut_short
+from agents.delivery.spool_file import require_schema, run_ends_in, runs_cut_short
 from protocol.disk.high_water_mark import Traces, look_beside
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
@@ -71,8 +70,8 @@ def read_spool(path: Path) -> SpoolState:
     traces = look_beside(path)
     try:
         with closing(sqlite3.connect(_read_only(path), uri=True, timeout=0.2)) as db:
-            return _spool_state(path, db, traces)
-    except sqlite3.Error as error:
+            return _spool_state(db, traces)
+    except (sqlite3.Error, ValueError) as error:
         if "locked" in str(error):
             raise InUseError(path, "an agent has it open") from None
         raise StoreError(path, f"is no usable spool: {error}") from None
@@ -85,10 +84,8 @@ def _read_only(path: Path) -> str:
     return f"{path.absolute().as_uri()}?mode=ro" + ("&immutable=1" if at_rest else "")
 
 
-def _spool_state(path: Path, db: sqlite3.Connection, traces: Traces) -> SpoolState:
-    (schema,) = db.execute("PRAGMA user_version").fetchone()
-    if schema != SPOOL_SCHEMA:
-        raise StoreError(path, f"has schema {schema}, this version knows {SPOOL_SCHEMA}")
+def _spool_state(db: sqlite3.Connection, traces: Traces) -> SpoolState:
+    require_schema(db)
     (depth,), (quarantined,) = (db.execute(f"SELECT COUNT(*) FROM {t}").fetchone() for t in ("sample", "quarantine"))  # noqa: S608
     meta = {key: int(value) for key, value in db.execute("SELECT key, value FROM meta")}
     oldest = db.execute("SELECT row FROM sample ORDER BY number LIMIT 1").fetchone()

@@ -6,8 +6,9 @@ Numba's compilation of kernels is said when it happens: at the first start in a 
 from __future__ import annotations
 
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 from sitegrid.process.lifetime import note, say
 
 EVERY_S = 5.0  # between two plain lines
-COMPILING = "first start: compiling kernels, about a minute"
+COMPILING = "first start: compiling kernels; it answers after the first ones, all take about a minute"
 
 
 class Display:
@@ -88,3 +89,22 @@ def compilation_reported() -> Iterator[None]:
 
     with install_listener("numba:compile", Counter()):
         yield
+
+
+@contextmanager
+def done_beside(parts: Iterable[object]) -> Iterator[None]:
+    """Have the parts of some work done on a thread of its own; the end waits for the part that is being done."""
+    ending = threading.Event()
+
+    def work() -> None:
+        for _ in parts:
+            if ending.is_set():
+                return
+
+    thread = threading.Thread(target=work, name="kernels", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join()

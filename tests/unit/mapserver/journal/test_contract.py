@@ -20,6 +20,7 @@ from mapserver.journal.rows import ALL, Admission, Selection, Watermark
 from mapserver.journal.sqlite.journal import SqliteJournal
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
+from protocol.version import package_version
 from protocol.wire.fields import pack, unpack
 from protocol.wire.messages import Ack, Refused
 from tests.postgres_server import Database
@@ -262,9 +263,13 @@ def test_losses_beyond_what_the_wire_has_can_be_asked_for(place):
 def test_another_schema_is_refused(place):
     place.open().close()
     place.sql("UPDATE meta SET value = '99' WHERE key = 'schema'")
-    for opened in (place.open, place.location.reader):
-        with pytest.raises(StoreError, match=r"schema '99', this version knows \d+; open it with the version that"):
-            opened()
+    version = package_version()
+    for statement, writer in ((None, f"sitegrid {version}"), ("DELETE FROM meta WHERE key = 'version'", "the version")):
+        if statement:
+            place.sql(statement)
+        for opened in (place.open, place.location.reader):
+            with pytest.raises(StoreError, match=rf"schema '99', this version knows \d+; open it with {writer} that"):
+                opened()
 
 
 class Faults:

@@ -1,0 +1,80 @@
+"""Wheel, source distribution, pins and bill of materials, tried outside of the checkout."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from importlib.metadata import distributions
+from pathlib import Path
+
+import pytest
+
+from tests.paths import ROOT
+from tests.release.stores import version
+
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
+PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid")
+
+
+def run(*words: str | Path, folder: Path, **environment: str) -> str:
+    done = subprocess.run(
+        [*map(str, words)], cwd=folder, env={**os.environ, **environment}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{words}: {done.stdout[-1000:]}{done.stderr[-2000:]}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of the source distribution of what Git knows, so that nothing else can get into it."""
+    folder = tmp_path_factory.mktemp("packages")
+    names = run("git", "ls-files", "-z", folder=ROOT).split("\0")
+    for name in filter(None, names):
+        (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / "source" / name)
+    run(sys.executable, "-m", "venv", folder / "builder", folder=folder)
+    python = folder / "builder" / "bin" / "python"
+    run(python, "-m", "pip", "install", "--quiet", "setuptools>=77", folder=folder)
+    code = "import setuptools.build_meta as backend; backend.build_sdist('../dist')"
+    run(python, "-c", code, folder=folder / "source")
+    (source,) = (folder / "dist").glob("sitegrid-*.tar.gz")
+    run(python, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", source, folder=folder)
+    (wheel,) = folder.glob("sitegrid-*.whl")
+    return wheel
+
+
+def test_a_wheel_of_the_source_distribution_runs_a_demo_far_from_the_checkout(wheel: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    run(sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, wheel, folder=tmp_path)
+    code = f"import {', '.join(PACKAGES)}; print(*(one.__file__ for one in ({', '.join(PACKAGES)})))"
+    places = run(sys.executable, "-c", code, folder=tmp_path, PYTHONPATH=str(site)).split()
+    assert [Path(place).parent.parent for place in places] == [site] * len(PACKAGES)
+    words = ("demo", "--headless", "--json", "--seconds", "30", "--speed", "8", "--world", "fast", "--out", "out")
+    told = run(sys.executable, "-m", "sitegrid", *words, folder=tmp_path, PYTHONPATH=str(site))
+    assert json.loads(told.splitlines()[-1])
+    assert [*(tmp_path / "out").glob("*.png")]
+
+
+def test_a_bill_of_materials_names_all_that_is_installed_with_its_licence() -> None:
+    bill = json.loads(run(sys.executable, "-m", "tests.release.bill", folder=ROOT))
+    assert bill["bomFormat"] == "CycloneDX"
+    parts = {(part["name"].lower(), part["version"]): part["licenses"] for part in bill["components"]}
+    assert set(parts) == {(one.metadata["Name"].lower(), one.version) for one in distributions()}
+    without = [name for (name, _), licences in parts.items() if not licences]
+    assert len(without) < len(parts) / 20, without
+
+
+def test_a_bundle_installs_without_a_network_and_nothing_else_than_what_it_says(tmp_path: Path) -> None:
+    wheels, venv = tmp_path / "wheels", tmp_path / "venv"
+    run("make", f"PYTHON={sys.executable}", f"WHEELS={wheels}", "OF=security", "bundle", folder=ROOT)
+    run(sys.executable, "-m", "venv", venv, folder=tmp_path)
+    install = (venv / "bin" / "pip", "install", "--quiet", "--no-index", "--find-links", wheels, "--require-hashes")
+    run(*install, "--requirement", wheels / "requirements.txt", folder=tmp_path)
+    assert version() in run(venv / "bin" / "sitegrid", "--version", folder=tmp_path)
+    (one,) = wheels.glob("msgpack-*.whl")
+    one.write_bytes(one.read_bytes() + b"!")
+    with pytest.raises(AssertionError, match="DO NOT MATCH"):
+        run(*install, "--force-reinstall", "--requirement", wheels / "requirements.txt", folder=tmp_path)
