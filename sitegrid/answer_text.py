@@ -273,7 +273,7 @@ def _calibration_row(machine: MachineCalibration) -> list[str]:
     if machine.spans:
         span = machine.spans[-1]
         since = utc_text(span.from_ns) if span.from_ns else "ever"
-        newest = f"{span.zero:g}, {span.scale:g}, {span.across:g} {since}"
+        newest = f"{span.zero:zg}, {span.scale:zg}, {span.across:zg} {since}"
         decided = machine.by + (f": {machine.reason}" if machine.reason else "")
     return [machine.name, *map(_value, values), "; ".join(shown) or "-", newest, decided]
 

@@ -37,7 +37,7 @@ def segments(read: Read, query: SegmentsQuery) -> answers.Segments:
     if len(chosen) > MOST_SEGMENTS:
         problem = f"{len(chosen)} segments; at most {MOST_SEGMENTS} are answered: ask for less with `bounds`"
         raise QueryError(Refusal.TOO_LARGE, problem)
-    return answers.Segments(*_version(roads), hours, traffic.placed, tuple(rows.records(sorted(chosen))))
+    return answers.Segments(*_version(roads), hours, traffic.placed, tuple(rows.of_segments(sorted(chosen))))
 
 
 def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
@@ -54,7 +54,7 @@ def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
         hours,
         query.target,
         float(lost.work_j[sorted(inside)].sum() / max(hours, 1e-9) / JOULE_PER_KWH),
-        tuple(rows.ranked(ranks[: query.limit])),
+        tuple(rows.of_segments(ranks[: query.limit])),
         tuple(rows.of_changes(changes[:MOST_CHANGES])),
     )
 
@@ -117,7 +117,7 @@ class _Records:
         machines = traffic.totals()["machines"]
         self._machines: Ints = np.bitwise_count(machines[:, 0] | machines[:, 1]).astype(np.int64)
 
-    def records(self, chosen: Sequence[int]) -> list[answers.RoadSegment]:
+    def of_segments(self, chosen: Sequence[int]) -> list[answers.RoadSegment]:
         """Records of these segments, made column by column."""
         at, lost = np.array(chosen, np.int64), self.lost
         passes = lost.passes[at] / self.hours
@@ -171,7 +171,7 @@ class _Rows:
         self._work = np.stack([lost.work_j, lost.low_j, lost.high_j], axis=1) / records.hours
         self._kg = lost.kg.mean(axis=1)
 
-    def ranked(self, ranks: Sequence[tuple[int, int]]) -> list[answers.WorklistRow]:
+    def of_segments(self, ranks: Sequence[tuple[int, int]]) -> list[answers.WorklistRow]:
         """Rows of these segments and ranks, made column by column."""
         chosen, at = [i for i, _ in ranks], np.array([i for i, _ in ranks], np.int64)
         work, changes = self._work[at], [self._last.get(i) for i in chosen]
@@ -179,7 +179,7 @@ class _Rows:
         days = list(map(slice, *(np.searchsorted(self._days.segment, side).tolist() for side in (at, at + 1))))
         columns: tuple[Iterable[Any], ...] = (
             [rank for _, rank in ranks],
-            self._records.records(chosen),
+            self._records.of_segments(chosen),
             *(map(tuple, values.tolist()) for values in a_row),
             self._since_ns[at].tolist(),
             [change.before if change else None for change in changes],
