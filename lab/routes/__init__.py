@@ -1,1 +1,1 @@
-"""Accuracy of routes against work truly spent, and of cheapest ways against a finer search."""
+"""Accuracy of routes against true work, and of cheapest ways against a finer search."""

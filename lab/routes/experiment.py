@@ -1,4 +1,4 @@
-"""Routes and ways judged: whole pipelines on random soil patches, and drawn maps."""
+"""Routes and ways judged: whole pipelines on random soil patches; drawn maps."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ DIGITS = 2
 
 @dataclass(frozen=True)
 class RouteCase:
-    """A row: a scenario. longer: relative recording length; 0: ways on drawn maps."""
+    """A scenario. longer: relative recording length; 0: ways on drawn maps."""
 
     name: str
     longer: float = 1.0
 
     def drive(self, seed: int, seconds: float) -> RoadDrive:
-        """Recording of a seed, shared with `python -m lab roads` at equal length."""
+        """A seed's recording, shared with `python -m lab roads` at equal length."""
         return planned(self.name, seed, seconds * self.longer)
 
 
@@ -45,7 +45,7 @@ WORST = ("energy_pct", "back_pct", "time_pct")  # the worst seed is judged too
 def run(
     runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[RouteCase] = CASES
 ) -> tuple[Report, None]:
-    """Record, replay, calibrate and judge; a row per case. Ways use maps drawn from the first seed."""
+    """Record, replay, calibrate, judge; a row per case. Ways use maps drawn from the first seed."""
     wanted = [case for case in cases if case.longer]
     tasks = {
         (case, seed, index): replay_task(Agent(index, closed_tours=True), case.drive(seed, seconds))

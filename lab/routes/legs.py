@@ -1,4 +1,4 @@
-"""Drives from stop to stop or around a tour, with their routes on map and true map."""
+"""Drives between stops or around a tour, with routes on map and true map."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from sim.truth import WORK
 from sitegrid.proof.figures import root_mean_square
 from sitegrid.proof.tracks import LoadTrack
 
-LEAST_M = 100.0  # shorter drives between stops are manoeuvring
+LEAST_M = 100.0  # shorter drives are manoeuvring
 STANDING_MPS = 0.05
-POINT_M = 1.0  # point spacing of lines: closer points, near standstill, have no direction
-BACK_M, ALIGNED = 3.0, 0.7  # a tour closes at this distance with at least this cosine of headings
+POINT_M = 1.0  # closer points, near standstill, have no direction
+BACK_M, ALIGNED = 3.0, 0.7  # a tour closes within this distance, at this cosine of headings or more
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _leg(table: Table, track: LoadTrack, begin: int, end: int, machine: RouteMac
 
 
 def _spans(table: Table, track: LoadTrack) -> Iterator[tuple[int, int, tuple[bool, bool]]]:
-    """First and last instant of each leg, and whether the machine stood there."""
+    """First and last instant of each leg, and standstill there."""
     speed = table["speed"]
     moves = np.abs(speed) > STANDING_MPS
     edges = np.flatnonzero(np.diff(moves.astype(int))) + 1
@@ -109,7 +109,7 @@ def _laps(track: LoadTrack, begin: int, end: int) -> Iterator[tuple[int, int]]:
 
 
 def _stated_kg(samples: Table, span_ns: Ints, described_kg: float) -> float:
-    """Median mass stated by a span's samples, else the described mass."""
+    """Median mass of a span's samples, else the described one."""
     own = samples["mass_kg"][(samples["stamp_ns"] >= span_ns[0]) & (samples["stamp_ns"] <= span_ns[1])]
     known = own[np.isfinite(own)]
     return float(np.median(known)) if known.size else described_kg
@@ -119,12 +119,12 @@ def _stated_kg(samples: Table, span_ns: Ints, described_kg: float) -> float:
 
 
 Judged = dict[str, float]
-# Legs of one drive: share for length and mass, distance for places along the lines.
+# Legs of one drive: tolerance of length and mass, distance along the lines, places compared.
 ALIKE, ALIKE_M, PLACES = 0.05, 10.0, 9
 
 
 def judged_legs(drive: FleetDrive, recorded: Recorded, scene: Scene, cache: Path) -> list[Judged]:
-    """Figures of every leg: relative route errors, and whether the interval holds the truth."""
+    """Each leg's relative route errors, and whether the interval holds the truth."""
     known, truth = KnownMap(recorded.rows), true_squares(scene.truth)
     routes = known.routes()
 
@@ -140,7 +140,7 @@ def judged_legs(drive: FleetDrive, recorded: Recorded, scene: Scene, cache: Path
 
 
 def drives_of(legs: Sequence[Leg]) -> list[int]:
-    """Drive that each leg repeats: one line with one load has common errors, however often driven."""
+    """Drive repeated by each leg: one line with one load has common errors, however often driven."""
     numbers: list[int] = []
     for i, leg in enumerate(legs):
         same = (numbers[k] for k in range(i) if _alike(leg, legs[k]))
@@ -179,13 +179,13 @@ def _judged(leg: Leg, there: RouteTotals, back: RouteTotals, truth: Squares) -> 
 
 
 def _rolling(leg: Leg, truth: Squares) -> float:
-    """Resistance times distance [m]: a drive without starts, stops or climbs."""
+    """Resistance times distance [m], without starts, stops, climbs."""
     middles = 0.5 * (leg.line_m[1:] + leg.line_m[:-1])
     return float((truth.at(middles)["resistance_filled"] * np.hypot(*np.diff(leg.line_m, axis=0).T)).sum())
 
 
 def seed_figures(legs: Sequence[Judged]) -> dict[str, float]:
-    """Percent over one recording's legs: RMS, means, worst leg, shares inside intervals."""
+    """Percent over a recording's legs: RMS, means, worst, shares inside intervals."""
     column = {name: np.array([leg[name] for leg in legs]) for name in legs[0]}
     holds = [column["energy_inside"][column["drive"] == number].mean() for number in np.unique(column["drive"])]
     return {

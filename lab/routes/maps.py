@@ -1,4 +1,4 @@
-"""Maps to query for routes: a server's from samples, and the truth in the same form."""
+"""Maps for routes: a server's from samples, and the truth in its form."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SITE = SiteConfig("judged", 48.0, 9.0)
 
 
 class KnownMap:
-    """A server's map from samples, with the parts of a source that routes need."""
+    """A server's map from samples; the parts of a source that routes need."""
 
     def __init__(self, samples: Mapping[str, Table], site: SiteConfig = SITE) -> None:
         self.site, self.config = site, ServerConfig()
@@ -56,7 +56,7 @@ class KnownMap:
 
 
 def true_squares(truth: TruthMap) -> Squares:
-    """A true map as read by routes: known everywhere, without uncertainty."""
+    """A true map for routes: known everywhere, certain."""
     rows, columns = truth.c_rr.shape
     edge = max(rows, columns)
 

@@ -1,4 +1,4 @@
-"""Cheapest ways on drawn maps, against a search with 64 neighbours, known answers, and the truth."""
+"""Cheapest ways on drawn maps against a 64-neighbour search, known answers and truth."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from sitegrid.proof.figures import Row
 from tests.reference.least_cost import least_cost
 
 SIZE = 150  # cells per side
-HILLS_M, HILL_CELLS, PATCH_CELLS = 2.0, 20.0, 8.0  # standard deviation of heights (10 % slopes), feature sizes
+HILLS_M, HILL_CELLS, PATCH_CELLS = 2.0, 20.0, 8.0  # std of heights (10 % slopes), feature sizes
 SAND, WET, GRAVEL, PAVED = 0.25, 0.06, 0.03, 0.012
 MARGIN = 15  # cells between ends and map edge
 UNKNOWN = 0.38  # share of a map
-SHUNNED = 1.0  # avoidance of bad ground, in standard deviations of a drawn field
+SHUNNED = 1.0  # avoidance of bad ground, in std of a drawn field
 SLOW = RouteMachine(mass_kg=20_000.0, speed_mps=2.0, power_w=400_000.0)  # neither power nor curves matter
 STAMP_NS = 1_767_225_600_000_000_000
 MAPS = {"random": 50, "even": 50, "sand": 20, "unknown": 20}
@@ -78,7 +78,7 @@ def _even(draw: np.random.Generator) -> Row:
 
 
 def _sand(draw: np.random.Generator) -> Row:
-    """A field of sand between the ends, with a way around on one side."""
+    """Sand between the ends, with a way around."""
     flat = np.zeros((SIZE, SIZE))
     row, column = np.mgrid[:SIZE, :SIZE]
     left, right = np.sort(draw.integers(2 * MARGIN, SIZE - 2 * MARGIN, 2))
@@ -94,7 +94,7 @@ def _sand(draw: np.random.Generator) -> Row:
 
 
 def _unknown(draw: np.random.Generator) -> Row:
-    """A server's view of a map with a third undriven, bad ground preferred; judged by the truth."""
+    """A server's view of a map, a third undriven, bad ground preferred; judged by truth."""
     terrain = drawn(draw)
     layers = (terrain.resistance, terrain.grade_east, terrain.grade_north)
     c_rr, east, north = (layer.astype(np.float32) for layer in layers)
@@ -129,7 +129,7 @@ def _cost(terrain: CostField, start: Cell, end: Cell) -> float:
 
 
 def _ends(draw: np.random.Generator, allowed: Bools | None = None) -> tuple[Cell, Cell]:
-    """Cells on two opposite sides of a map."""
+    """Cells on two opposite sides."""
     while True:
         rows_, columns = draw.integers(MARGIN, SIZE - MARGIN, 2), (MARGIN, SIZE - MARGIN)
         ends = [(int(row), column) for row, column in zip(rows_, columns, strict=True)]
@@ -138,6 +138,6 @@ def _ends(draw: np.random.Generator, allowed: Bools | None = None) -> tuple[Cell
 
 
 def _field(draw: np.random.Generator, cells: float, size: int) -> Floats:
-    """Smooth random field of standard deviation 1."""
+    """Smooth random field, std 1."""
     field = gaussian_filter(draw.standard_normal((size, size)), cells)
     return np.asarray(field / field.std())

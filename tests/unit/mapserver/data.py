@@ -50,7 +50,7 @@ def now_ns() -> int:
 
 
 def samples(n: int = 1, **columns: Any) -> Table:
-    """Plain samples: 1 m each on dry dirt at the centre of cell (8, 8), unless columns differ."""
+    """1 m each on dry dirt at the centre of cell (8, 8), unless columns differ."""
     rows = empty(n)
     usual = {"x_m": 8.5, "y_m": 8.5, "distance_m": 1.0, "c_rr": 0.04, "grade_e": 0.1, "grade_n": -0.05}
     usual |= {"stamp_ns": NOW_NS + np.arange(n) * 10**9, "cov_xx_m2": 0.01, "cov_yy_m2": 0.01}
@@ -93,14 +93,12 @@ def incoming(rows: Table, first_seq: int = 1, machine: str = "a", spool_id: int 
 
 
 def put(journal: Journal, sent: SampleBatch, received_ns: int = NOW_NS, lost: int = 0) -> None:
-    """One batch as one journal row."""
     journal.begin()
     journal.append(Admission(sent, trimmed=0, lost=lost), received_ns)
     journal.commit()
 
 
 def fold_of(rows: Iterable[JournalRow], without: Container[str] = ()) -> Grid:
-    """Map folded from all rows."""
     grid = Grid(SITE.cell_m, CONFIG.fold)
     for row in rows:
         if row.machine not in without:
@@ -115,7 +113,7 @@ def folded(rows: Table, machine: str = "a", cell_m: float = 1.0, waiting_rows: i
 
 
 def is_by_definition(grid: Grid, rows: Table, machine: str = "a") -> bool:
-    """Whether a grid equals the reference for these samples, bit for bit."""
+    """Whether a grid equals the reference, bit for bit."""
     return plain(of_grid(grid)) == plain(by_definition([(machine, rows)], grid.cell_m, grid.config))
 
 
@@ -128,7 +126,6 @@ def total(grid: Grid) -> np.ndarray:
 
 
 def same(one: Grid, other: Grid) -> bool:
-    """Equal to the bit."""
     return same_state(one.state(), other.state())
 
 
@@ -166,7 +163,6 @@ APART = {"keep_buckets": 1000}  # no test's bucket is ever summed
 
 
 def merged(parts: Iterable[Grid]) -> Grid:
-    """Merge separately folded grids."""
     first, *more = parts
     for part in more:
         first.merge(part)
@@ -198,14 +194,13 @@ def past_of(writer: Writer) -> StorePast:
 
 @contextmanager
 def refused(reason: str, match: str | None = None) -> Iterator[None]:
-    """Refusal for this reason, in these words."""
     with pytest.raises((QueryError, MessageError), match=match) as caught:
         yield
     assert caught.value.reason == reason
 
 
 class Replies:
-    """Answers to batches, in order of arrival."""
+    """Answers to batches, in order."""
 
     def __init__(self) -> None:
         self.all: list[tuple[int, Ack | Refused]] = []

@@ -114,7 +114,6 @@ def _slow(n: int, std: float, draw: np.random.Generator) -> Floats:
 
 
 def ledgers(rows: Mapping[str, Table]) -> dict[str, Table]:
-    """Stays by machine."""
     out = {}
     for name, table in rows.items():
         ledger = StayLedger()

@@ -77,7 +77,6 @@ def check(state: MachineErrors, errors: Errors, zero: float = 0.0016, scale: flo
 
 
 def concrete(x_m: Floats, _: Floats, __: Floats) -> Floats:
-    """Uniform."""
     return np.full(len(x_m), 0.008)
 
 
@@ -220,7 +219,7 @@ def test_an_epoch_in_which_the_zero_steps_states_a_large_deviation() -> None:
 
 def test_a_ramp_that_is_only_ever_climbed_shows_no_scale() -> None:
     rows = drive(RAMP, Errors(scale=0.1))
-    climbed = rows[rows["y_m"] < 25.0]  # only the climb is sampled
+    climbed = rows[rows["y_m"] < 25.0]
     result = solve({"a": climbed})
     assert not result.common.observed
     assert result.common.reason == "no_slope_both_ways"
@@ -305,7 +304,7 @@ def test_on_level_ground_a_gain_unlike_all_others_is_a_fault_and_corrected() -> 
     (first, *_) = [each for each in result.corrections if each.machine == "d"]
     assert first.scale == pytest.approx(0.6 / 1.6, abs=0.05)
     assert {each.scale for each in result.corrections if each.machine != "d"} == {0.0}
-    two = solve({"a": rows["a"], "d": rows["d"]})  # which of them is wrong is unknown
+    two = solve({"a": rows["a"], "d": rows["d"]})  # either may be wrong
     assert all(state.beyond[1] < FAULT_SIGMAS[1] for state in two.machines.values())
 
 

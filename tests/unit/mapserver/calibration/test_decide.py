@@ -41,7 +41,7 @@ def solved(*corrections: Correction, begins_ns: int = LAST_NS) -> Solution:
 
 
 class Solver:
-    """Consecutive solves, a minute apart; decisions are effective at once."""
+    """Solves a minute apart; decisions are effective at once."""
 
     def __init__(self, *decisions: CalibrationDecision) -> None:
         self.decisions = CalibrationDecisions(decisions)
@@ -58,7 +58,7 @@ class Solver:
         return sum(len(decision.corrections) for decision in made)
 
     def watches(self, time_ns: int, *corrections: Correction) -> None:
-        """For this time, with unchanged solves."""
+        """So long, with unchanged solves."""
         for _ in range(time_ns // EVERY_NS):
             self.hears(*corrections, after_ns=EVERY_NS)
 
@@ -294,7 +294,7 @@ def test_a_scale_and_a_lateral_zero_that_are_found_late_are_those_of_all_samples
 
 
 def test_what_was_shown_of_a_scale_then_stays():
-    """After a repair, an earlier finding was right for its time; and faults begin somewhere."""
+    """After a repair, an earlier finding held for its time; and faults begin somewhere."""
     solver = Solver()
     solver.watches(2 * EVERY_NS, one(0.001, scale=0.08))
     later = one(0.001, 1100, scale=-0.02)

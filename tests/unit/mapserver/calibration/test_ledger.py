@@ -1,4 +1,4 @@
-"""Ledgers: independent of order, newest epochs kept, content of the samples."""
+"""Ledgers: order has no effect, the newest epochs stay, samples keep their content."""
 
 import numpy as np
 import pytest

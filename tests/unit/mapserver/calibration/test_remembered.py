@@ -115,7 +115,6 @@ def applied(rows: Table, zero: Floats | float) -> Table:
 
 
 def decided(rows: Mapping[str, Table]) -> CalibrationDecisions:
-    """After three solves."""
     solved, decisions = calibrate(ledgers(rows)), CalibrationDecisions()
     for i in range(3):
         for decision in decisions.judge(solved, START_NS + i * EVERY_NS):

@@ -31,7 +31,7 @@ BIN = float(np.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0]))
 
 
 def passes(*grounds: float, column: str = "c_rr", distance_m: float = 1.0, noise: float = 0.0) -> TimedPages:
-    """Pages of a block fully driven once an hour, with this ground."""
+    """Pages of a block fully driven each hour, with this ground."""
     x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
     grid, draw = Grid(1.0, FoldConfig(keep_buckets=100)), np.random.default_rng(1)
     for hour, ground in enumerate(grounds):
@@ -120,7 +120,7 @@ def test_a_change_is_more_than_its_samples_state_by_machines_and_by_passes(machi
 
 
 def two_passes(*grounds: dict[float, float]) -> TimedPages:
-    """Pages of a block fully driven twice; per pass the metres by ground."""
+    """Pages of a block fully driven twice; metres by ground per pass."""
     x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
     grid = Grid(1.0, FoldConfig())
     for hour, metres in enumerate(grounds):
@@ -212,7 +212,7 @@ def test_a_change_without_resistance_must_be_twice_as_wide():
 def test_size_is_in_metres():
     assert counts(square(6), cell_m=1.0, size_m=3.0).any()
     assert not counts(square(6), cell_m=0.4, size_m=3.0).any()  # 8 cells; 6 are too few
-    assert counts(square(1), cell_m=5.0, size_m=3.0).sum() == 1  # at least one cell
+    assert counts(square(1), cell_m=5.0, size_m=3.0).sum() == 1
 
 
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 75), (75, 0), (75, 75), (20, 75)])

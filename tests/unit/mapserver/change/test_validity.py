@@ -167,7 +167,7 @@ def test_where_nothing_was_driven_since_the_page_of_the_change_counts():
     first, pages = firsts(grid, last_ns + 60 * 10**9)
     assert {pages[i].first_ns for i in first[:128].tolist()} == {last_ns}
     first, _ = firsts(grid, last_ns + 100 * HOUR_NS)
-    assert (first == 0).all()  # after all evidence: better old than none
+    assert (first == 0).all()  # old beats none
 
 
 def test_an_age_before_a_change_of_the_cells_takes_nothing_back():

@@ -20,7 +20,7 @@ UNITS = ev.WEIGHT_UNITS_PER_M
 HOUR_NS = 3600 * 10**9
 
 
-# All admissible kinds of row: unknown, still, nowhere, at borders.
+# All kinds of admissible row: unknown, still, nowhere, at borders.
 edge = st.sampled_from([-32.0, -16.0, -0.5, 0.0, 7.5, 15.999, 16.0])
 wide = st.one_of(st.floats(-40, 40), edge)
 unknown = st.just(np.nan)
@@ -40,7 +40,7 @@ sample = st.fixed_dictionaries({
 
 
 def admitted(drawn: list[dict[str, float]], shrunk: float = 1.0):
-    """Samples as drawn with smaller standard deviations, all admitted."""
+    """Samples as drawn, standard deviations reduced; all admitted."""
     column = {name: np.array([one[name] for one in drawn]) for name in drawn[0]}
     x, y = column.pop("std_x") * shrunk, column.pop("std_y") * shrunk
     column["cov_xy_m2"] = 0.999 * column.pop("correlation") * x * y

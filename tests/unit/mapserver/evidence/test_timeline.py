@@ -19,7 +19,7 @@ SPACE = Space()
 
 
 def page(bucket: int, weight: int = 1, cells: tuple[int, ...] = (5,)) -> Record:
-    """A page of these cells with the bucket's stamp and a vote of this weight each."""
+    """These cells, the bucket's stamp, a vote of this weight each."""
     numbers = np.array(sorted(cells), np.uint64)
     known = np.zeros(len(cells), CELL)
     known["cell"], known["visits"], known["machines"], known["newest_ns"] = numbers, 1, 1, bucket * BUCKET_S * S + 7

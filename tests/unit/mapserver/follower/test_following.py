@@ -212,7 +212,7 @@ class Course:
                 deliver(writer, seed, machine="ab"[seed % 2])
             for name in self.decides:
                 writer.run(lambda store, name=name: store.decide(TrustDecision(name, False, PERSON, "drifts", NOW_NS)))
-            if self.archives:  # none left in the journal, equal numbers
+            if self.archives:  # none left in the journal, numbers equal
                 assert archive_all(folder, writer)
             return writer.run(lambda store: store.version)
 

@@ -230,7 +230,7 @@ def batches(rows: Table, draw: np.random.Generator) -> Iterator[Table]:
 
 
 def taken(credit: BlockCredit, rows: Table) -> int:
-    """Samples accepted from a sender that halves refused batches and drops single refused samples."""
+    """Samples accepted from a sender that halves refused batches, then drops refused samples."""
     try:
         credit.spend("a", rows)
     except MessageError:
@@ -315,7 +315,7 @@ def test_memory_goes_with_what_was_driven(known: list[tuple[int, int]], every_s:
 )
 @pytest.mark.parametrize("known", [[], EVERYWHERE])
 def test_no_honest_machine_meets_it_fast_or_slow(known: list[tuple[int, int]], mps: float, hz: float, std_m: float):
-    """The last is parked with wandering positions: half a metre per sample not driven by its wheels."""
+    """The last is parked with wandering positions: 0.5 m per sample that its wheels did not drive."""
     draw, n = np.random.default_rng(6), 10_000
     heading, step_m = np.cumsum(draw.normal(0, 0.02, n)), mps / hz
     x_m, y_m = np.cumsum(step_m * np.stack([np.cos(heading), np.sin(heading)]), axis=1) + draw.normal(0, std_m, (2, n))

@@ -120,7 +120,7 @@ def test_what_is_refused_or_not_committed_is_neither_journalled_nor_paid_for(sto
 def test_info_tells_the_state_in_plain_values(store):
     far = samples(2, cov_xx_m2=10.0, x_m=900.0, stamp_ns=NOW_NS + 10**12)
     store.commit([incoming(samples(3)), incoming(samples(2), spool_id=8), incoming(far, machine="b")])
-    store.grid.known_cells()  # folds waiting samples, on which cells and bounds follow
+    store.grid.known_cells()  # folds waiting samples, which updates cells and bounds
     info = store.info()
     assert (info["samples_merged"], info["samples_too_unsure"], info["cells"]) == (5, 2, 1)
     assert (info["bounds"], info["stamp_ns"]) == ((0, 0, 16, 16), NOW_NS + 10**12)
@@ -229,7 +229,7 @@ def test_a_run_that_is_bound_to_another_store_is_refused_until_a_person_accepts_
         store.accept(GONE, "its disk died")
         store.accept(GONE, "its disk died")  # idempotent
         assert len(store.journal.events("accepted_store")) == 1
-    with closing(open_store(tmp_path)) as store:  # holds after a restart
+    with closing(open_store(tmp_path)) as store:
         assert store.info()["accepted"] == [GONE]
         assert store.commit([bound])[0] == Ack(5, 1, 0, store.identity.id, replaces=GONE)
         assert store.machines()["a"]["lost"] == 3  # samples only in the other store are counted
@@ -302,7 +302,7 @@ def test_a_snapshot_beyond_the_journal_is_named_before_it_is_removed(tmp_path, c
 def test_samples_that_are_missing_are_counted_until_they_are_declared_lost(tmp_path, caplog):
     store = open_store(tmp_path)
     store.commit([incoming(samples(3))])
-    store.journal._mark.write({f"a {7:016x}": 5, f"b {8:016x}": 2})  # as of a longer journal
+    store.journal._mark.write({f"a {7:016x}": 5, f"b {8:016x}": 2})  # as a longer journal had
     store.close()
     store = open_store(tmp_path)
     assert {name: entry["missing"] for name, entry in store.machines().items()} == {"a": 2, "b": 2}

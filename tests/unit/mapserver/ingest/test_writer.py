@@ -243,7 +243,7 @@ def test_after_a_bug_a_restart_folds_what_was_committed(start, monkeypatch, tmp_
         writer.submit(incoming(samples(4)), lambda _: None)
         wait_for(lambda: writer.failed)
         writer.close()
-    assert snapshot_rows(tmp_path) == []  # a half-folded grid is not kept
+    assert snapshot_rows(tmp_path) == []  # a half-folded grid is dropped
     again = start()
     assert send(again, [incoming(samples(4))]) == [Ack(4, 1, trimmed=4, store=writer.store_id)]
     assert again.info()["samples_merged"] == 4

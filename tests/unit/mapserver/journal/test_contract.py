@@ -29,7 +29,7 @@ from tests.unit.mapserver.data import NOW_NS, SITE, batch, fold_of, incoming, ra
 
 @dataclass
 class Place:
-    """A journal's place. sql: run a statement on another connection."""
+    """sql: run a statement on another connection."""
 
     location: JournalLocation
     sql: Callable[[str], Any]
@@ -249,7 +249,7 @@ def test_samples_at_minus_zero_are_no_damage(place):
 
 
 def test_losses_beyond_what_the_wire_has_can_be_asked_for(place):
-    """One machine's declared loss must not block reading all others' state."""
+    """One machine's declared loss must not block reading the others' state."""
     most = 2**62
     with closing(place.store()) as store:
         for spool_id in range(1, 7):

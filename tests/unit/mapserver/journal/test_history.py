@@ -492,7 +492,7 @@ YEAR_NS = 365 * 24 * HOUR_NS
 
 
 def test_rows_that_came_in_next_year_keep_nothing_from_the_archive(tmp_path):
-    """Two rows came with the server's clock a year ahead; they belong to the next right row's hour."""
+    """Two rows came with the server's clock a year ahead; they count for the next right row's hour."""
     with opened(tmp_path) as machines:
         for hours, off_ns in ((0, 0), (0, YEAR_NS), (1, YEAR_NS), (1, 0), (2, 0), (5, 0)):
             machines.send(3, NOW_NS + hours * HOUR_NS + off_ns)

@@ -357,7 +357,7 @@ def test_a_mark_that_is_torn_or_behind_is_no_alarm(folder, kept):
 
 
 def cut_short(folder: Path, share: float = 0.5) -> None:
-    """Cut the log's end, as after a flip in its middle."""
+    """As after a flip in its middle."""
     log = folder / "journal.db-wal"
     log.write_bytes(log.read_bytes()[: int(log.stat().st_size * share)])
 

@@ -21,7 +21,6 @@ MANY = 2000  # per row, so a dump exceeds a pipe
 
 
 def fill(store: Store, machine: str, rows: int) -> None:
-    """Rows for a slow dump."""
     batches = [incoming(random_samples(MANY, n), 1 + n * MANY, machine) for n in range(rows)]
     assert all(isinstance(answer, Ack) for answer in store.commit(batches))
 
@@ -40,7 +39,6 @@ def dumping(database: Database) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def restored_from(text: bytes, cluster: Cluster) -> Database:
-    """A new database from a dump."""
     database = cluster.new_database()
     words = [str(server.binaries() / "psql"), "--quiet", "--set=ON_ERROR_STOP=1", f"--dbname={database.url}"]
     done = subprocess.run(words, input=text, capture_output=True, check=False)

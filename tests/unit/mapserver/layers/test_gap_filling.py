@@ -31,7 +31,6 @@ def window(c_rr=0.04, grade_e=0.0, grade_n=0.0, known=True, weight=4.0, std=RESI
 
 
 def columns(*spans):
-    """Cells of these column spans."""
     mask = np.zeros((ROWS, COLUMNS), bool)
     for first, end in spans:
         mask[:, first:end] = True

@@ -40,7 +40,7 @@ class PastStore:
         list(archive(self.folder / FOLDER, self.reader, SITE, NOW_NS + rows * HOUR_NS, self.journal.forget))
 
     def make(self, closed_ns: int, without: Iterable[str] = ()) -> int:
-        """Make a checkpoint; returns the number of steps."""
+        """Returns the number of steps."""
         return sum(1 for _ in make(self.past, self.reader, closed_ns, Facts(frozenset(without))))
 
     def as_of(self, to_ns: int, without: Iterable[str] = (), **more: object) -> Grid:

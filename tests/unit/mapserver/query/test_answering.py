@@ -18,7 +18,7 @@ from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, open_writer, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 
-# A sample per cell of two diagonals, with the value naming the cell.
+# A sample per cell of two diagonals; the value names the cell.
 STEPS = np.arange(-40, 40)
 
 

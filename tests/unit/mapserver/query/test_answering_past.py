@@ -75,7 +75,7 @@ def test_the_map_as_of_a_time_is_that_of_a_server_that_knew_no_more(answers, ser
     then = answers.region(RegionQuery(Bounds(*bounds), NAMES, as_of_ns=stamp_ns))
     known = until(ROWS, stamp_ns)
     only = served(known).region(RegionQuery(Bounds(*bounds), NAMES))
-    # ages count from the time asked for, not from the last sample before it
+    # Ages count from the time asked for, not from the last sample before it.
     assert equal(then, only, [name for name in NAMES if name not in ("age_s", "changed_s")])
     late_s = (stamp_ns - max(int(table["stamp_ns"].max()) for table in known.values())) / S
     np.testing.assert_allclose(then["age_s"], only["age_s"] + late_s, atol=0.01)

@@ -1,4 +1,4 @@
-"""Answers of roads and worklists, now and as of any time, for all the map's ingredients."""
+"""Roads and worklists as answered, now and as of any time, after each kind of change."""
 
 import threading
 from collections import Counter
@@ -48,7 +48,6 @@ def writer(tmp_path):
 
 
 def deliver(writer, parts):
-    """Samples by machine and part."""
     sent = Counter()
     for rows in parts:
         for name, own in rows.items():
@@ -355,7 +354,6 @@ WHOLE = RouteQuery(((15.0, 10.0), (205.0, 10.0)))
 
 
 def row_of(answers: Answers, query: RouteQuery) -> int:
-    """The journal row of a route."""
     return decode_answer(answers.answer(query)).version.row
 
 
@@ -504,7 +502,7 @@ def test_traffic_of_one_machine_on_the_roads_of_all(writer):
 
 @pytest.mark.slow
 def test_burned_litres_stand_beside_predicted_ones_in_the_list_and_at_changes(tmp_path):
-    """Equal prices: sections burning by their resistance are predicted right; those without fuel have none."""
+    """Equal prices: predictions are right for sections burning by their resistance, absent without fuel."""
     worse = np.concatenate([of_both(8, 0.02, 0.0)["a"], of_both(6, 0.06, 1800.0)["a"]])
     worse["fuel_l"] = 0.5 * 40_000 * 9.80665 * worse["c_rr"] / (0.4 * 35.8e6)
     with closing(open_writer(tmp_path)) as opened:

@@ -58,7 +58,6 @@ def passes(
 
 
 def grid_of(*machines: Table) -> Grid:
-    """The machines' evidence."""
     grid = Grid(1.0, FoldConfig())
     for i, rows in enumerate(machines):
         grid.fold(rows, f"truck-{i}")
@@ -66,12 +65,10 @@ def grid_of(*machines: Table) -> Grid:
 
 
 def roads_of(grid: Grid, skeletons: Skeletons | None = None) -> SegmentTable:
-    """The map's roads."""
     blocks = grid.blocks_in(EVERYWHERE)
     pages = dict(zip(blocks, grid.pages(blocks), strict=True))
     return segments(network((skeletons or Skeletons(1.0)).skeleton(pages)))
 
 
 def roads(*machines: Table) -> SegmentTable:
-    """Roads from samples."""
     return roads_of(grid_of(*machines))

@@ -1,4 +1,4 @@
-"""Roads of known lines: detection and cuts, determined only by samples and facts."""
+"""Roads of known lines: detection and cuts depend only on samples and facts."""
 
 from collections import Counter
 from itertools import pairwise

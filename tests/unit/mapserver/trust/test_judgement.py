@@ -1,4 +1,4 @@
-"""Judgements: limits from both sides, votes, clocks; resulting decisions."""
+"""Judgements: both sides of each limit, votes, clocks, resulting decisions."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, replace

@@ -62,7 +62,7 @@ BATCH = 20
 
 
 class HeldFold:
-    """In front of `fold_history`: holds each fold until released. without: of each fold begun."""
+    """Holds each `fold_history` until released. without: of each fold begun."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.without: list[set[str]] = []

@@ -22,7 +22,7 @@ class Site:
         self._seq = 0
 
     def rows_after(self, samples_sent: int, passed_s: float = 0.0) -> list[int]:
-        """Snapshot rows after more samples (a row each) and time."""
+        """Snapshot rows after more samples, a row each, and time."""
         for _ in range(samples_sent):
             self._seq += 1
             send(self.writer, [incoming(samples(1), self._seq)])
