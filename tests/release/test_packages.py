@@ -53,8 +53,8 @@ def test_a_wheel_of_the_source_distribution_runs_a_demo_far_from_the_checkout(wh
     places = run(sys.executable, "-c", code, folder=tmp_path, PYTHONPATH=str(site)).split()
     assert [Path(place).parent.parent for place in places] == [site] * len(PACKAGES)
     words = ("demo", "--headless", "--json", "--seconds", "30", "--speed", "8", "--world", "fast", "--out", "out")
-    told = run(sys.executable, "-m", "sitegrid", *words, folder=tmp_path, PYTHONPATH=str(site))
-    assert json.loads(told.splitlines()[-1])
+    printed = run(sys.executable, "-m", "sitegrid", *words, folder=tmp_path, PYTHONPATH=str(site))
+    assert json.loads(printed.splitlines()[-1])
     assert [*(tmp_path / "out").glob("*.png")]
 
 

@@ -229,9 +229,9 @@ def test_the_doctor_listens_to_a_bus_with_the_signals_of_its_driver(
     bus.write_text("".join(f"(1795688127.0) can0 {identifier:08X}#{data.hex()}\n" for identifier, data in sent))
     with (tmp_path / "quarry" / "agent.toml").open("a", encoding="utf-8") as agent:
         agent.write(ON_BUS.format(address=json.dumps(str(bus))))
-    found = [finding for finding in examine_folder(tmp_path / "quarry") if str(bus) in str(finding)]
-    assert [finding.level for finding in found] == [level]
-    assert sentence in str(found[0])
+    findings = [finding for finding in examine_folder(tmp_path / "quarry") if str(bus) in str(finding)]
+    assert [finding.level for finding in findings] == [level]
+    assert sentence in str(findings[0])
 
 
 def test_the_doctor_looks_at_data_and_ports_and_leaves_a_running_agent_its_receivers(
