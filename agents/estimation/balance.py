@@ -84,8 +84,8 @@ class BalanceStep:
     """One usable step of the force balance: raw = direction cos(slope) c_rr + scale error * share.
 
     stamp_ns: its end. distance_m: since the last usable step. raw: calibrated [-]. regressor: direction cos(slope) [-].
-    share: drive force over weight, signed ahead [-]; share_var: by the powertrain. lead_share: share of load on the leading
-    axle; wheelbase_m, lead_m: trailing axle and load centre behind it; without a wheelbase, one ground.
+    share: drive force over weight, signed ahead [-]; share_var: by the powertrain. lead_share: load share of the
+    leading axle; wheelbase_m, lead_m: trailing axle and load centre behind it; without a wheelbase, one ground.
     """
 
     stamp_ns: int
