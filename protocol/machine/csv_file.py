@@ -45,7 +45,7 @@ class CsvFile:
     def check(self, row: Row) -> None:
         """RowError for a row that does not count, ValueError if unknown."""
         for name, least in self.at_least.items():
-            if not float(row[name]) >= least:  # also for NaN
+            if not float(row[name]) >= least:  # also true for NaN
                 raise RowError("below_least", f"{name}: {row[name]} is below {least:g}")
 
 
