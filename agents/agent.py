@@ -133,7 +133,6 @@ class Agent:
         return described(self._status.judge(known)) | known
 
     def _known(self, driver: Driver) -> dict[str, Any]:
-        """State of all parts."""
         uplink, owner = self._uplink, self._presence.owner
         spool = {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._unsaved.given_up}
         self._clocks = self._pipeline.clocks()
@@ -192,7 +191,6 @@ class Agent:
         return pose is not before
 
     def _take(self, made: Samples) -> None:
-        """Queue samples for the next write."""
         self._unsaved.add(made.pending, made.final)
         if len(made.pending):
             self._status.sampled()
@@ -241,7 +239,6 @@ class Agent:
             aid.lanes = lanes
 
     def _lanes(self) -> dict[str, Any] | None:
-        """State of the lanes; None if unused."""
         aid, link = self._pipeline.lanes, self._lane_link
         return {**aid.report(), "counters": dict(link.counters)} if aid and link else None
 

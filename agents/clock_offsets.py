@@ -196,7 +196,6 @@ class _Motion:
 
 
 def _motion(sensor: SensorConfig, machine: MachineConfig, projection: Projection, kept_ns: float) -> _Motion | None:
-    """The motion of a sensor that shows it."""
     shows = sensor.mode == ABSOLUTE if sensor.kind == Gps.kind else sensor.frame == BASE
     if not (sensor.use and shows and KINDS[sensor.kind] in SHOWING):
         return None

@@ -242,7 +242,6 @@ class DeadReckoning:
         self.ground = None
 
     def _turn(self, imu: Imu, sensor: SensorConfig) -> None:
-        """Integrate a rear-frame gyro's vertical rate, as its share in the mean."""
         if imu.sensor not in self._up:
             self._up[imu.sensor] = sensor.mount.frame_from_sensor()[2].tolist()
         up = self._up[imu.sensor]
@@ -260,7 +259,6 @@ class DeadReckoning:
         self._turned_ns = odometry.stamp_ns
 
     def _roll(self, reading: WheelReading, sensor: SensorConfig) -> None:
-        """Advance by a wheel sensor's roll, as its share in the mean."""
         stamp_ns, offset_m = reading.stamp_ns, sensor.mount.xyz_m[1]
         wheel = self._wheels.setdefault(reading.sensor, _Wheel(reading, offset_m, self.angle_rad))
         others = [w for w in self._wheels.values() if w is not wheel and _speaks(w.reading.stamp_ns, stamp_ns)]

@@ -114,7 +114,6 @@ class GroundTracker:
         self._last = None
 
     def _begin(self, mps: complex, angle_rad: float, *, reverses: bool) -> None:
-        """Take a velocity as ahead."""
         shown_rad = cmath.phase(mps) - angle_rad + math.pi * reverses
         if not self._corrections or math.cos(shown_rad - self._offset_rad) < AGREES:
             self._offset_rad, self._corrections = shown_rad, 0

@@ -201,7 +201,6 @@ class Pipeline:
         return Samples(rows, self._sampler.final_samples(corrected))
 
     def _corrected(self, pose: PoseBelief) -> PoseBelief | None:
-        """The smoothed pose, widened after a jump; None while unknown."""
         known = self._track.corrected(pose)
         return less_sure(known, self._watch.off_m(pose.stamp_ns)) if known else None
 

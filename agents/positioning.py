@@ -149,7 +149,6 @@ class Positioning:
         return replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)) if sensor.delay_s else reading
 
     def _take(self, readings: Sequence[Reading]) -> Accepted | None:
-        """Process one stamp's readings; None if all are refused."""
         taken: list[Sensed] = []
         smoothed: list[SmoothedPose] = []
         concluded: list[PoseBelief] = []

@@ -94,7 +94,6 @@ class ReadingsRecorder:
             self._recording = None
 
     def _open(self, log_ns: int) -> Recording:
-        """Make room and open the next file."""
         kept_bytes = (FILES - 1) * self._file_bytes
         for path in sorted(self._folder.glob(f"{self._machine}.*.mcap*"), reverse=True):
             kept_bytes -= path.stat().st_size
@@ -104,7 +103,6 @@ class ReadingsRecorder:
         return Recording(self._folder / f"{self._machine}.{begin:%Y%m%dT%H%M%S.%fZ}.mcap", self._about, self._clock)
 
     def _fail(self, error: OSError) -> None:
-        """Keep the readable part, and retry later."""
         self._problem = f"readings are not recorded: {error.filename}: {error.strerror}"
         self._again_s = self._clock() + AGAIN_S
         if self._recording:

@@ -204,7 +204,6 @@ class Sampler:
         return np.array(rows, SAMPLE_DTYPE) if rows else NOTHING
 
     def _is_usable(self, pose: PoseBelief, e: GroundEstimate) -> bool:
-        """Whether it makes a sample; reasons are counted."""
         if not self.is_clear(pose.stamp_ns):
             self.withheld["place_unclear"] += 1
             return False

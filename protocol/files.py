@@ -123,7 +123,6 @@ def _open_locked(path: Path, permissions: int) -> tuple[Path, BinaryIO]:
 
 
 def _remove_if_left(part: Path) -> None:
-    """Remove an unlocked file."""
     try:
         with part.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

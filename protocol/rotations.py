@@ -1,7 +1,7 @@
 """Rotations and angles (REP-103): yaw @ pitch @ roll, pitch positive nose down, angles in [-pi, pi).
 
-One attitude or arrays; vectors, matrices and quaternions (x, y, z, w) have their axes first. Plain sums of products,
-since `@` and `einsum` round differently with the number of attitudes.
+Of one attitude or arrays, axes first; quaternions are (x, y, z, w). Plain sums of products: `@` and `einsum` round
+differently with the number of attitudes.
 """
 
 import math

@@ -80,10 +80,10 @@ class OwnPort:
 
 @dataclass(frozen=True)
 class CorrectionsState:
-    """State of a base, pure; all times but stamps by the machine's monotonic clock.
+    """State of a base, pure; times but stamps by the machine's monotonic clock.
 
-    heard_ns: last message of the relay. true_ns: when the newest frame reached the relay, or None. fastest_ns: least
-    lag of arrivals behind stamps, clock offset included; so late messages show, and wrong clocks do not.
+    heard_ns: last message. true_ns: when the newest frame reached the relay, or None. fastest_ns: least lag of arrivals
+    behind stamps, with the clock offset; so late messages show, and wrong clocks do not.
     """
 
     base: str

@@ -125,7 +125,6 @@ class NtripStream:
             self._socket.sendall(f"{gga(*self._place, datetime.now(UTC))}\r\n".encode())
 
     def _answer(self) -> tuple[bytes, bool]:
-        """Await the answer; as `judge`."""
         answer, end_s = b"", self._clock() + CONNECT_S
         while (judged := judge(answer, self._caster, is_all=len(answer) > MAX_ANSWER_BYTES)) is None:
             if (left_s := end_s - self._clock()) <= 0:

@@ -1,10 +1,9 @@
 """The audit file: what an agent recorded, line by line, to compare with the server's journal.
 
 `+ <spool_id> <seq> <hash>`: a recorded sample; a later line replaces it (its final value). `- <spool_id> <seq>`: an
-identity made void by renumbering. `? <spool_id> <seq> <hash>`: what the disk held at opening, if not the noted value. A
-damaged disk may return to the value before the final one, which may be delivered already, so either hash counts. Lines
-follow the commit; opening the spool adds those that a crash prevented. So every line was on disk once, and lost commits
-show as a loss.
+identity made void by renumbering. `? <spool_id> <seq> <hash>`: what a damaged disk held at opening, maybe the value
+before the final one; either may be delivered, so both count. Lines follow the commit; opening the spool adds those that
+a crash prevented. So every line was on disk once, and lost commits show as a loss.
 """
 
 from collections.abc import Iterable

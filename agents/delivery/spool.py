@@ -265,7 +265,6 @@ class Spool:
                 raise StoreError(self._path, f"cannot be used: {error}; look at the machine's disk") from None
 
     def _open(self, traces: Traces) -> None:
-        """Create or read the file, report its losses, and start a run."""
         with transaction(self._db):  # in one transaction: a kill leaves all or nothing
             make_or_check(self._db)
             self._meta = _Meta(**{k: int(v) for k, v in self._db.execute("SELECT key, value FROM meta")})
@@ -282,7 +281,6 @@ class Spool:
             self._audit.complete(self._identified())
 
     def _runs_of_file(self) -> list[SpoolRun]:
-        """Runs that have or had samples."""
         runs = [_run_from(*row) for row in self._db.execute("SELECT * FROM run ORDER BY base")]
         return [run for run in runs if run.base < self._meta.newest]
 

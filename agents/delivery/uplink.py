@@ -56,9 +56,9 @@ class Pacing:
     """Batch sizes and pauses.
 
     first_batch: samples at first; halved on a timeout, doubled while exchanges are short. max_batch: a tenth of the
-    server's limit. backoff_s, max_backoff_s: pause after a failure, doubled each time, randomised to 50 to 100 % so
-    that a fleet does not return to a restarted server at once. gather_s: pause once all is sent, as each batch costs
-    the server a row and a sync.
+    server's limit. backoff_s, max_backoff_s: pause after a failure, doubled each time, randomised so that a fleet does
+    not return to a restarted server at once. gather_s: pause once all is sent, as a batch costs the server a row and a
+    sync.
     """
 
     first_batch: int = 200

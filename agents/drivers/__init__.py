@@ -1,7 +1,7 @@
 """The driver door: simulation, replay and real sensors enter an agent as one stream of readings.
 
-A `Driver` gives readings. A `Source`, made by a [[driver]] table, built in or a plug-in, gives values with times of the
-host's monotonic clock; `Sources` (agents/drivers/sources.py) turns them into readings in UTC.
+A `Driver` gives readings. A `Source`, made by a [[driver]] table, gives values with times of the host's monotonic
+clock; `Sources` (agents/drivers/sources.py) turns them into readings in UTC.
 """
 
 from collections.abc import Mapping, Sequence

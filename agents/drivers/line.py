@@ -87,7 +87,6 @@ class Line:
         return Observed(sensor.name, STREAMS[message.stream], values, host_ns, message.utc_ns)
 
     def _undelayed_ns(self, stream: str, tag_ns: int, host_ns: int) -> int:
-        """Arrival of a tagged value without its delay."""
         tie = self._ties.setdefault(stream, ClockTie())
         is_new = host_ns > tie.heard_ns or not self._file_ns  # in a file, only the first after a stated time came then
         if is_new and not tie.take(tag_ns, host_ns):

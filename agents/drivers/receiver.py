@@ -85,7 +85,6 @@ class ReceiverSource:
         self._transport = None
 
     def _open(self, timeout_s: float) -> Transport | None:
-        """Open the port, if due."""
         if (early_s := self._retry_s - self._now_s()) > 0:
             self._wait(min(early_s, timeout_s))
             return None
@@ -105,7 +104,6 @@ class ReceiverSource:
         self._tell(why)
 
     def _judge(self, *, has_frames: bool, is_live: bool) -> None:
-        """Judge the port by new bytes."""
         self._heard_s = now_s = self._now_s()
         if has_frames:
             self._framed_s = now_s
@@ -156,7 +154,6 @@ class ReceiverSource:
         return "waiting for its date" if seen.values else f"no fix yet: {seen.satellites} satellites"
 
     def _tell(self, problem: str) -> None:
-        """Log a problem as it begins and ends."""
         if problem != self._problem:
             log.warning("receiver port=%s problem=%r", self._address, problem or "none: it is read")
         self._problem = problem

@@ -105,7 +105,6 @@ class Sources:
                 return
 
     def _readings(self, clock: str, value: Observed) -> list[Reading]:
-        """Readings of a value and of those that waited."""
         if not value.sensor:
             self._time_base.take(clock, value.utc_ns, value.host_ns)
         if self._time_base.utc_ns(value.host_ns) is None:

@@ -36,7 +36,6 @@ class ClockTie:
         return True
 
     def _is_set(self, ahead_ns: int, host_ns: int) -> bool:
-        """Whether the clock was set, or is new."""
         if self.offset_ns is None:
             return True
         if not self._doubted[1] or abs(ahead_ns - self._doubted[0]) > APART_NS:

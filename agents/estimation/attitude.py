@@ -140,7 +140,6 @@ class SlopeFilter:
     def _correct(
         self, lateral_mps2: float, speed_mps: Sequence[float | None], noise: float, variance_ahead: float | None
     ) -> bool:
-        """Correct by the known speeds; returns whether one jumped."""
         P, jumped, (ahead, left) = self._covariance, False, speed_mps
         slips_mps = -lateral_mps2 * abs(ahead if ahead is not None else self._x[6])  # sideways, per unit of slip
         of_ahead = (noise, JUMP_SIGMA) if variance_ahead is None else (variance_ahead, OUTLIER_SIGMA)

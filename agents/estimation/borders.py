@@ -88,7 +88,6 @@ class BorderSearch:
         self._borders.append((*recent, number))
 
     def _measure(self, step: BalanceStep, raw: float, r: float) -> None:
-        """Condition all histories on the step, and score them."""
         rows, lead = self._rows, step.regressor * step.lead_share
         trail = step.regressor - lead
         with_lead = lead * rows[LEAD_VAR] + trail * rows[COVARIANCE]  # covariances with the measurement

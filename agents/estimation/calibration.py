@@ -165,7 +165,6 @@ class Calibrator:
         return _Stretch(newest.stamp_ns, x, y, pose.angle_rad, newest.direction, unbalanced, share)
 
     def _partner(self, stretch: _Stretch) -> _Stretch | None:
-        """Nearest stretch in the other direction."""
         partner, nearest_m = None, self._tuning.pair_m
         for other in reversed(self._past):
             if (stretch.stamp_ns - other.stamp_ns) * 1e-9 > self._tuning.pair_s:

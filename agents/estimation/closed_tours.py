@@ -108,7 +108,6 @@ class ClosedTours:
         return self._pass_cell(balance, pose) if variance_m2 < MOST_STD_M**2 else None
 
     def _pass_cell(self, balance: Balance, pose: PoseBelief) -> Tour | None:
-        """Mark this cell, or close a loop at its mark."""
         cell, sums = (math.floor(pose.x_m / CELL_M), math.floor(pose.y_m / CELL_M)), self._sums
         mark = self._marks.setdefault(cell, sums)
         if len(self._marks) > KEPT:

@@ -51,7 +51,6 @@ class Offers:
         return offer
 
     def _problem(self, offer: CalibrationOffer, now_ns: int) -> str:
-        """Why it does not count now, or ""."""
         if offer.machine != self._machine:
             return "wrong_machine"
         if offer.stamp_ns < self._newest_ns:

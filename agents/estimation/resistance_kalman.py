@@ -156,7 +156,6 @@ class KalmanResistance:
         return self._steps[index - 1] if index else self._first
 
     def _set_borders(self, numbers: Collection[int]) -> None:
-        """Set borders before these steps; filter again from the first change."""
         first = self._count - len(self._steps) + 1
         borders = [number in numbers for number in range(first, self._count + 1)]
         changed = next((i for i, old in enumerate(self._steps) if old.border != borders[i]), len(borders))

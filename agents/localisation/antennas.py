@@ -141,7 +141,6 @@ class Antennas:
         trial.n += 1
 
     def _follow(self, stamp_ns: int, place_m: complex, dead_reckoning: DeadReckoning) -> None:
-        """End the stretch if it is long enough or not straight."""
         now = stamp_ns, place_m, dead_reckoning.travel_m, dead_reckoning.distance_m
         if self._begin is None or stamp_ns <= self._begin[0]:
             self._begin = now

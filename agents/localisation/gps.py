@@ -161,7 +161,6 @@ class Receivers(ModalSensors[Fix]):
         return float(error.dot(error)) / 2 / self._error(name).variance_m2
 
     def _error(self, name: str) -> GpsError:
-        """The current slow error."""
         drift_m2, time_s, anchor_m2 = self._drift_m2[name], self._sensors[name].drift_time_s, self._anchor_m2.get(name)
         common_m2 = min(self.machine_share or 0.0, MOST_SHARED) * drift_m2
         # a relative one has errors now, at its first fix, and the filter's then

@@ -1,8 +1,8 @@
 """The localiser: readings to poses. It collects until the heading shows, then tests it until it is proven.
 
-A heading by GPS may be wrong, as a receiver that has just started is tens of metres off. So it is unproven at first,
-and all events are kept. If the filter refuses a receiver until it relocks, the heading is withdrawn: events before the
-refusals no longer count, the rest is aligned and filtered again.
+A receiver that has just started is tens of metres off, so a heading by GPS is unproven at first, and all events are
+kept. If the filter refuses a receiver until it relocks, the heading is withdrawn: what preceded the refusals is
+dropped, the rest aligned and filtered again.
 """
 
 import math
@@ -33,9 +33,9 @@ from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; cost grows with its inverse
-COLLECTED = 24_000  # capacity in events while the heading is unproven: 20 minutes
-PROVEN_S = 30.0  # time without refusals, over a further DISTANCE_M, that proves a heading
-UNSIGNED_M = 60.0  # distance after which a first motion over ground counts as ahead: its speed may never change
+COLLECTED = 24_000  # events kept while the heading is unproven: 20 minutes
+PROVEN_S = 30.0  # time without refusals, and a further DISTANCE_M, to prove a heading
+UNSIGNED_M = 60.0  # distance after which a first motion over ground counts as ahead
 REFUTED_SIGMA = 3.0  # deviations by which refused fixes refute a proven heading
 FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
@@ -48,11 +48,10 @@ class LocalisationConfig:
     """How positions are found.
 
     filter: ekf or ukf. profile: "paper" takes GPS errors as white, with filterpy's filters (extra `paper`); "default"
-    estimates a slow error per receiver, a bias per yaw gyro and the wheel scale. start: x, y [m] and heading [rad] in
-    `map`, if known: then alignment and GPS are not needed. It counts once: after a pause or clock jump the machine may
-    be anywhere. slip, slip_soft: wheel slip per traction on firm ground, and its rise with rolling resistance; of the
-    tyres. lag_s: lag of the smoother, 0 for none; "paper" has none. map_aid: "auto" finds the machine's lane on the
-    shared map; "off" and "paper" do not.
+    estimates a slow error per receiver, a bias per yaw gyro and the wheel scale. start: known x, y [m] and heading
+    [rad] in `map`, instead of alignment and GPS; it counts once, not after a pause or clock jump. slip, slip_soft: of
+    the tyres, per traction on firm ground, and its rise with rolling resistance. lag_s: of the smoother, 0 for none, as
+    in "paper". map_aid: "auto" uses lanes of the shared map, except in "paper"; "off" never.
     """
 
     filter: str = "ukf"
@@ -97,10 +96,10 @@ class HeadingRefutedError(ArithmeticError):
 
 
 class Localiser:
-    """Fuses GPS, IMUs and wheels into 15 states and slow sensor errors, from readings in nearly any order.
+    """Fuses GPS, IMUs and wheels into 15 states and slow sensor errors.
 
-    engine: the filter; experiments may replace it before the first reading. is_weighed: whether the load is known.
-    is_proven: whether poses may become samples. watch: for position jumps.
+    engine: the filter; experiments may replace it before the first reading. is_weighed: the load is known. is_proven:
+    poses may become samples. watch: for position jumps.
     """
 
     def __init__(
@@ -134,7 +133,7 @@ class Localiser:
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
         self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
         self._refused: deque[Fix] = deque(maxlen=COLLECTED)  # since the last accepted one
-        self._since: tuple[int, float] = (0, 0.0)  # stamp of the first fix that counts, and distance at the alignment
+        self._since: tuple[int, float] = (0, 0.0)  # stamp of the first fix that counts, distance at the alignment
         self._aligned_scale = 0.0  # of the wheels, by the newest alignment
         self._poses: deque[PoseBelief] = deque(maxlen=COLLECTED)  # of the unproven heading
         self._smoothed: list[SmoothedPose] = []
@@ -175,10 +174,7 @@ class Localiser:
 
     @property
     def wheel_scale(self) -> float | None:
-        """Wheel travel over machine travel, less 1; None if it is no state.
-
-        As estimated; by the alignment's fixes while the heading is unproven.
-        """
+        """Wheel travel over machine travel, less 1; of the alignment while the heading is unproven; None: no state."""
         return self._aligned_scale if self.is_aligned and not self.is_proven else self._tracker.wheel_scale
 
     @property
@@ -210,8 +206,7 @@ class Localiser:
     def update(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Add the readings of one stamp, after dead reckoning; returns new or changed poses in stamp order.
 
-        Poses of an unproven heading come again once it is proven. HeadingRefutedError: a proven heading is wrong; only
-        a new start helps.
+        Poses of an unproven heading come again once proven. HeadingRefutedError: only a new start helps.
         """
         distance_m, was_proven = dead_reckoning.distance_m, self.is_proven
         beliefs: list[Belief] = []
@@ -238,7 +233,7 @@ class Localiser:
     def _judge_sign(self, sign: TravelSign, step: FilterStep, dead_reckoning: DeadReckoning) -> None:
         """Check the sign of speeds over ground, as the first motion may have been in reverse.
 
-        If wrong, what was collected is discarded. HeadingRefutedError if it led to a proven heading.
+        If so, collected events are dropped; HeadingRefutedError if the heading was proven.
         """
         dt_s, self._stepped_ns = (step.stamp_ns - self._stepped_ns) * 1e-9, step.stamp_ns
         for mean in (step.imu_means[name] for name in self._accelerometers if name in step.imu_means):
@@ -260,7 +255,6 @@ class Localiser:
                 kept.clear()
 
     def _events(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[Event]:
-        """Filter events of one stamp's readings; a completed step comes first."""
         events: list[Event] = []
         for reading, sensor in readings:
             if isinstance(reading, Gps):
@@ -331,7 +325,7 @@ class Localiser:
         return fix.stamp_ns - self._since[0] >= PROVEN_S * 1e9
 
     def _holds(self, distance_m: float) -> bool:
-        """Whether a wrong heading would have shown by now, and no fix is refused."""
+        """Whether a wrong heading would have shown by now."""
         return self.is_aligned and distance_m - self._since[1] >= DISTANCE_M and not self._refused
 
     def _keep(self, poses: Sequence[PoseBelief]) -> None:
@@ -342,7 +336,6 @@ class Localiser:
             self._poses.append(pose)
 
     def _proven_poses(self) -> list[PoseBelief]:
-        """All poses since the start; buffers are cleared."""
         poses = list(self._poses)
         for kept in (self._poses, self._steps, self._fixes, self._velocities):
             kept.clear()
@@ -357,7 +350,6 @@ class Localiser:
             self._steps.append(event)
 
     def _collect(self, event: Event, distance_m: float) -> list[Belief]:
-        """Keep an event until the heading is known, then filter everything."""
         is_blind = isinstance(event, FilterStep) and event.silent and not event.wheels.is_known
         if is_blind and not self._config.start:
             return []  # no start before it has moved

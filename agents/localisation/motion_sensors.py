@@ -137,7 +137,6 @@ class MotionSensors:
             self._load_doubt = self._tuning.load_doubt
 
     def _whole_imu(self, index: int, sensor: SensorConfig) -> Measurement:
-        """An IMU's measurement, but for stamp and value."""
         rate_std = self._gyro_std(sensor) if sensor.provides("rate") else UNKNOWN_STD
         force_std = sensor.std.get("force", self._tuning.force_mps2) if sensor.provides("force") else UNKNOWN_STD
         R, lever = np.diag([rate_std**2] * 3 + [force_std**2] * 3), np.array(sensor.mount.xyz_m)

@@ -191,7 +191,6 @@ class Tracker:
         return beliefs + self._follow_lanes(fusion, event.reckoned)
 
     def _follow_lanes(self, fusion: Fusion, reckoned: DeadReckonedPose) -> list[Belief]:
-        """Beliefs changed by lanes, at the end of a window."""
         aid = self.lanes
         if aid is None or not aid.is_due(reckoned):
             return []
@@ -217,7 +216,6 @@ class Tracker:
         return beliefs
 
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
-        """Filter a value, anchored where needed."""
         if sensors.needs_anchor(value):
             sensors.anchor(value, fusion.at(value.stamp_ns))
         measurement = sensors.measurement(value)

@@ -93,7 +93,6 @@ def _record(values: Mapping[str, int], crc: int) -> tuple[bytes, int]:
 
 
 def _read(path: Path) -> tuple[dict[str, int], int, int]:
-    """Newest values, end of sound records, last checksum."""
     values: dict[str, int] = {}
     try:
         data = path.read_bytes()

@@ -77,7 +77,6 @@ class ReadingColumns:
         }
 
     def _steps(self, site: SiteConfig) -> list[Callable[[Values], None]]:
-        """Conversions of described columns."""
         variances = [name for name in columns(self.sensor.kind) if name.startswith("var_")]
         squared = {std: name for name in variances if (std := std_name(name)) in self.described}
         steps: list[Callable[[Values], None]] = [_squares(squared)] if squared else []

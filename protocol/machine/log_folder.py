@@ -130,7 +130,6 @@ class LogFolder:
             self.first_refused.setdefault(reason, f"{source.file.file} line {line}: {columns_}: {problem}")
 
     def _rows(self, source: SensorFile) -> Iterator[_Numbered]:
-        """A file's rows that are readings, with line."""
         path, parse = self.data / source.file.file, self._parser(source)
         with opened_rows(source.file, self.data) as rows:
             for column in (source.stamp, *source.columns.described.values()):
@@ -150,7 +149,6 @@ class LogFolder:
             raise LogFolderError(path, f"none of its rows can be used; {problem}")
 
     def _parser(self, source: SensorFile) -> Callable[[Row], Reading]:
-        """Function from row to reading; RowError."""
         sensor, values = source.sensor, source.columns.reader(self.site)
         stamp, ahead_ns = stamp_reader(source.stamp, self.start_ns), round(source.ahead_s * 1e9)
         described = {"stamp": source.stamp, **source.columns.described}

@@ -111,7 +111,6 @@ def decode_region(data: bytes) -> answers.Region:
 
 
 def _take_piece(table: dict[str, Any], columns: int, rows: int) -> answers.Piece | None:
-    """The place of a piece, if stated."""
     if table.get("piece") is None:
         return None
     piece = take_record(answers.Piece, table, "piece")

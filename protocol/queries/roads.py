@@ -124,7 +124,6 @@ class Worklist:
 
 
 def _said(items: list[tuple[str, object]]) -> dict[str, object]:
-    """Fields of a record, without unknown fuel."""
     return {name: value for name, value in items if name != "fuel" or value is not None}
 
 

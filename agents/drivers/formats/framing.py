@@ -121,7 +121,6 @@ def _nmea_end(buffer: bytes | bytearray, start: int) -> int | None:
 
 
 def _nmea_is_whole(frame: bytes) -> bool:
-    """Exclusive or between dollar and star."""
     checksum = 0
     for byte in frame[1:-3]:
         checksum ^= byte

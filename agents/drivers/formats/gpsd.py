@@ -33,7 +33,6 @@ class GpsdDecoder:
         return self._fix(report) if report["class"] == "TPV" else ()
 
     def _fix(self, report: dict[str, Any]) -> Sequence[Message]:
-        """Time, position, velocity."""
         device = report.get("device")
         source = device.lower() if isinstance(device, str) and device.lower() in self._devices else ""
         if report.get("mode") not in (PLANE, SPACE) or "time" not in report:

@@ -118,14 +118,12 @@ class Fusion:
         return before or (stamp_ns == first.stamp_ns and first is not newest)
 
     def _place(self, stamp_ns: int) -> int:
-        """Index of the node of a stamp, new if necessary."""
         index = bisect_left(self._nodes, stamp_ns, key=_stamp)
         if index == len(self._nodes) or self._nodes[index].stamp_ns != stamp_ns:
             self._nodes.insert(index, _Node(stamp_ns))
         return index
 
     def _filter_from(self, index: int, fresh: Collection[str]) -> None:
-        """Filter from a node on, at which these sensors are new."""
         for i in range(index, len(self._nodes)):
             before, node = self._nodes[i - 1].belief, self._nodes[i]
             assert before is not None
@@ -155,7 +153,6 @@ class Fusion:
         return belief
 
     def _judge(self, node: _Node, measurement: Measurement, result: Conditioned) -> None:
-        """Count, and relock a sensor refused too often."""
         sensor = measurement.sensor
         self.last[sensor] = result
         if result.accepted:

@@ -225,7 +225,6 @@ class WheelJudge:
                 self._note(name, run, now)
 
     def _fixed(self, fix: Gps) -> complex | None:
-        """The place; None for a repeat."""
         pinned = fix.lat_deg, fix.lon_deg
         if self._pinned.get(fix.sensor) == pinned:
             return None
