@@ -185,10 +185,11 @@ def freed(belief: Belief, states: slice, variance: Floats) -> Belief:
     """
     seen, y, past = belief.P[states], -belief.x[states], belief.past
     S = seen[:, states] - np.diag(np.maximum(variance, seen[:, states].diagonal()) / (1 - 1 / FREED))
-    K = np.linalg.solve(S, seen).T
+    K: Floats = np.linalg.solve(S, seen).T
     if past is not None:
         shown = past.transition[states]
-        past = past.informed(shown, np.linalg.solve(S, shown).T, y, K)
+        weighted: Floats = np.linalg.solve(S, shown).T
+        past = past.informed(shown, weighted, y, K)
     return Belief(belief.stamp_ns, belief.x + K.dot(y), belief.P - K.dot(seen), past=past)
 
 
