@@ -184,11 +184,12 @@ def freed(belief: Belief, states: slice, variance: Floats) -> Belief:
     stays definite, since a posterior is never wider than its prior.
     """
     seen, y, past = belief.P[states], -belief.x[states], belief.past
-    S = seen[:, states] - np.diag(np.maximum(variance, seen[:, states].diagonal()) / (1 - 1 / FREED))
-    K = np.linalg.solve(S, seen).T
+    R = -np.diag(np.maximum(variance, seen[:, states].diagonal()) / (1 - 1 / FREED))
+    inverse = np.linalg.inv(seen[:, states] + R)
+    K = seen.T.dot(inverse)
     if past is not None:
         shown = past.transition[states]
-        past = past.informed(shown, np.linalg.solve(S, shown).T, y, K)
+        past = past.informed(shown, shown.T.dot(inverse), y, K)
     return Belief(belief.stamp_ns, belief.x + K.dot(y), belief.P - K.dot(seen), past=past)
 
 

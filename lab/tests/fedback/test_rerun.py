@@ -44,7 +44,8 @@ def test_guards_without_lanes_change_nothing(nodes):
 @pytest.mark.slow
 def test_maps_are_what_their_names_say(nodes):
     rows = [("machine-1", nodes.rows)]
-    scene = Scene(rows, rows, int(nodes.stamp_ns[0]), SECONDS)
+    scene = Scene([*rows, ("machine-2", nodes.rows)], rows, int(nodes.stamp_ns[0]), SECONDS)
+    assert {tile.machines for tile in MAPS["others"](scene)("machine-1")(0).tiles.values()} == {1}
     assert np.allclose(np.hypot(*(moved(rows, 3.0)[0][1][n] - nodes.rows[n] for n in ("x_m", "y_m"))), 3.0)
     first, last = nodes.stamp_ns[0], nodes.stamp_ns[-1]
     for name, make_maps in MAPS.items():
