@@ -78,6 +78,7 @@ soak: venv
 OF ?= agent,can,postgres,receivers,security,server,web
 WHEELS ?= wheels
 bundle:
+	rm -rf build # else modules that are gone would be in it
 	"$(PYTHON)" -m pip wheel --quiet --disable-pip-version-check --constraint constraints.txt --wheel-dir '$(WHEELS)' '.[$(OF)]'
 	cd '$(WHEELS)' && sha256sum *.whl | awk '{split($$2, part, "-"); print part[1] "==" part[2] " --hash=sha256:" $$1}' > requirements.txt
 

@@ -23,7 +23,8 @@ from sitegrid.process.children import Child, Children, ProcessError
 from tests.integration.compose_database import DATABASE, DatabaseServer
 from tests.postgres_server import binaries
 
-NOT_HERE = ("", "PATH", "NUMBA_CACHE_DIR")  # with an empty folder each service would compile kernels
+# Of the build; and with an empty folder or another processor each service would compile kernels.
+NOT_HERE = ("", "PATH", "INSTALL", "NUMBA_CACHE_DIR", "NUMBA_CPU_NAME")
 _ENV = re.compile(r"^ENV (?P<pairs>(?:.*\\\n)*.*)$", re.MULTILINE)
 CHECK_S = 0.5  # between health checks, in place of the file's value
 
@@ -33,9 +34,9 @@ def load(path: Path) -> dict[str, Any]:
     return services
 
 
-def needed(services: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    """Services started by `docker compose up NAMES`, with dependencies; without names, all without profile."""
-    wanted = set(names or (name for name, service in services.items() if not service.get("profiles")))
+def needed(services: Mapping[str, Any], *names: str, profile: str = "demo") -> dict[str, Any]:
+    """Services started by `docker compose --profile PROFILE up NAMES`, with dependencies; without names, all."""
+    wanted = set(names or (name for name, service in services.items() if profile in service["profiles"]))
     while more := {other for name in wanted for other in services[name].get("depends_on", {})} - wanted:
         wanted |= more
     return {name: service for name, service in services.items() if name in wanted}
@@ -44,11 +45,7 @@ def needed(services: Mapping[str, Any], *names: str) -> dict[str, Any]:
 def image_environment(dockerfile: Path) -> dict[str, str]:
     """The image's environment without NOT_HERE."""
     pairs = [p for match in _ENV.finditer(dockerfile.read_text()) for p in shlex.split(match["pairs"])]
-    return {
-        name: value
-        for name, _, value in (pair.partition("=") for pair in pairs)
-        if name not in {"", "PATH", "NUMBA_CACHE_DIR"}
-    }
+    return {name: value for name, _, value in (pair.partition("=") for pair in pairs) if name not in NOT_HERE}
 
 
 @dataclass

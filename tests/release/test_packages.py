@@ -20,9 +20,9 @@ PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid")
 
 
 def run(*words: str | Path, folder: Path, **environment: str) -> str:
-    done = subprocess.run(
-        [*map(str, words)], cwd=folder, env={**os.environ, **environment}, capture_output=True, text=True, check=False
-    )
+    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}  # of the checkout
+    line, env = [*map(str, words)], inherited | environment
+    done = subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{words}: {done.stdout[-1000:]}{done.stderr[-2000:]}"
     return done.stdout
 

@@ -113,7 +113,14 @@ def test_profile_ha_has_two_servers_of_one_journal_and_not_the_one_without_datab
     journals = {line[line.index("--journal") + 1] for line in lines}
     assert len(journals) == 1
     assert [started[name]["volumes"] for name in ("server-a", "server-b")] == [["map-a:/data"], ["map-b:/data"]]
-    assert set(compose_run.needed(services())) == {"router", "server", "web", "sim", *MACHINES}, "without the profile"
+    of_demo, of_site = (set(compose_run.needed(services(), profile=name)) for name in ("demo", "site"))
+    assert of_demo == {"router", "server", "web", "sim", *MACHINES}
+    assert of_site == {"router", "server", "web"}
+    of_ha = set(compose_run.needed(services(), profile="ha"))
+    assert of_ha == set(started) - {"sim", *MACHINES} | {"web"}
+    for name, service in services().items():  # or Compose refuses the file
+        for other in service.get("depends_on", {}):
+            assert set(service["profiles"]) <= set(services()[other]["profiles"]), (name, other)
 
 
 def test_the_journal_of_profile_ha_is_at_both_databases_and_goes_to_the_one_that_takes_commits():
@@ -131,14 +138,21 @@ def test_only_this_host_gets_in_while_there_are_no_keys():
     assert ("--insecure" in commands()[0]) != ("--keys" in commands()[0])
 
 
-def test_the_image_has_the_extra_of_every_command_in_compose():
+def test_each_image_has_the_extras_of_its_commands_in_compose_and_the_version():
     import sitegrid.command_line
 
-    of_project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    extras = set(re.search(r'"\.\[(.*)\]"', DOCKERFILE.read_text())[1].split(","))
-    extras |= set(re.findall(r"\w+", str([of_project[name] for name in extras])))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    installed = re.findall(r'AS build-(\w+)\nRUN \$INSTALL "\.\[(.*)\]"', DOCKERFILE.read_text())
     parser = sitegrid.command_line.build_parser()
-    assert {parser.parse_args(line).extra for line in commands()} - {""} <= extras
+    for target, names in installed:
+        extras = set(names.split(","))
+        extras |= set(re.findall(r"\w+", str([project["optional-dependencies"][name] for name in extras])))
+        images = {"image": f"sitegrid-{target}:{project['version']}", "build": {"context": ".", "target": target}}
+        lines = [one["command"] for one in services().values() if one.get("build") == images["build"]]
+        assert {one["image"] for one in services().values() if one.get("build") == images["build"]} == {images["image"]}
+        assert {parser.parse_args(line).extra for line in lines} - {""} <= extras, target
+    assert {one["build"]["target"] for one in services().values() if "build" in one} == {name for name, _ in installed}
+    assert f'version="{project["version"]}"' in DOCKERFILE.read_text()
 
 
 def test_processes_get_the_time_that_they_take_to_end():
