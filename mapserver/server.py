@@ -185,6 +185,8 @@ def warm_up(config: ServerConfig) -> None:
 
 def warm_up_rest(config: ServerConfig) -> Iterator[None]:
     """Load all other kernels, one part at each step: calibration, roads, routes."""
-    yield ledger.warm_up()
-    yield road_maps.warm_up(config.fold)
-    yield routes.warm_up()
+    ledger.warm_up()
+    yield
+    road_maps.warm_up(config.fold)
+    yield
+    routes.warm_up()
