@@ -82,7 +82,7 @@ class DriveReadings:
     def take(self, speed_mps: float) -> Drive:
         """The drive force over the step that ends; of what came in before it, where nothing came in it."""
         drive, retarder = self._driven(speed_mps), self._fresh(Retarder)
-        if drive.unknown or not isinstance(retarder, Retarder):
+        if drive.unknown or not self.is_before_wheels or not isinstance(retarder, Retarder):
             return drive
         return retarded(self._train, drive, retarder.torque, speed_mps, self._radius_m)
 
@@ -102,7 +102,7 @@ class DriveReadings:
         return Drive(value / self._radius_m)
 
     def _engine(self, engine: Engine, torque: float, speed_mps: float) -> Drive:
-        losses, driveline, hydraulics = map(self._fresh, BESIDE[:3])
+        losses, driveline, hydraulics, _ = map(self._fresh, BESIDE)
         why = slips(driveline) if isinstance(driveline, Driveline) else ""
         if idle_pa := self._train.idle_pressure_pa:
             is_idle = isinstance(hydraulics, HydraulicPressure) and hydraulics.pressure_pa <= idle_pa

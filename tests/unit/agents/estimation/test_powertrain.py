@@ -134,6 +134,7 @@ def test_a_retarder_brakes_by_the_final_drive_and_leaves_doubt_in_proportion(spe
 def test_torque_at_the_wheels_counts_before_what_a_motor_or_engine_states() -> None:
     wheels = Torque("t", 10**9, 3000.0)
     assert taken(ENGINE, wheels, ENGINE) == taken(wheels) == powertrain.Drive(3000.0 / RADIUS_M)
+    assert taken(Retarder("r", 10**9, 0.4), wheels) == taken(wheels), "it is before the wheels"
     assert taken(MotorPower("p", 1, 1e4), Motor("m", 2, 100.0)).force_n == pytest.approx(100 * 48 * 0.9 / RADIUS_M)
 
 
