@@ -61,16 +61,20 @@ def test_an_image_is_small_and_says_what_it_is(built: Built, target: str) -> Non
     assert above <= MOST_MB[target]
 
 
-def test_a_site_of_containers_draws_a_map_and_compiles_nothing(built: Built, tmp_path: Path) -> None:
+def test_a_site_of_containers_draws_a_map_and_its_server_answers_before_anything_compiles(
+    built: Built, tmp_path: Path
+) -> None:
     endpoint = free_endpoint()
     place = ("--endpoint", endpoint, "--site-file", "config/site.toml")
-    with Containers(tmp_path) as containers:
+    said: list[dict[str, object]] = []
+    with Containers(tmp_path, said.append) as containers:
         router = containers.start("router", *built.words("server", "router", "--listen", endpoint, "--insecure"))
         router.expect("ready", PATIENCE_S)
         server = containers.start("server", *built.words("server", "server", *place, "--store", "/data/store"))
-        lines = [server.expect("ready", PATIENCE_S), *server.lines()]
+        server.expect("ready", PATIENCE_S)
         with connect(endpoint, "paper", timeout_s=PATIENCE_S) as client:
             assert client.info().samples_merged == 0
+            assert not [line for line in [*said, *server.lines()] if "compiling" in line], "kernels come with the image"
             names = [f"loader-{i}" for i in (1, 2, 3)]
             for name in names:
                 files = ("--config", "config/agent.toml", "--name", name, "--spool", f"/data/{name}.db")
@@ -79,5 +83,3 @@ def test_a_site_of_containers_draws_a_map_and_compiles_nothing(built: Built, tmp
             containers.start("sim", *built.words("sim", "sim", *words))
             until(lambda: set(client.info().machines) == set(names), "samples of all machines")
             assert client.ask(WorklistQuery()).store == client.info().store
-        lines += server.lines()
-        assert not [line for line in lines if "compiling" in line], "kernels come with the image"
