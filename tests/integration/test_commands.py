@@ -37,7 +37,7 @@ def test_query_and_plot_answer_people_and_machines(web: WebSite, tmp_path: Path)
     assert "visits" in only
     assert "resistance" not in only
     assert "resistance " in said("query", *where, "point", x, y).out
-    assert "unknown" in said("query", *where, "point", -500, -500).out
+    assert "nobody was there" in said("query", *where, "point", -500, -500).out
     saved = tmp_path / "region.npz"
     cells = said("query", *where, "--json", "region", 0, 0, 200, 150, "--out", saved).json
     assert cells["columns"] == 200

@@ -39,7 +39,9 @@ def test_a_notebook_runs_and_was_saved_with_its_answers(hauling: WebSite, name: 
 @pytest.mark.processes
 @pytest.mark.parametrize("page", ["README.md", "docs/tutorials/ask-from-python.md"])
 def test_the_python_of_a_page_runs_and_prints_what_stands_below_it(hauling: WebSite, page: str):
-    ((code, below),) = re.findall(r"```python\n(.*?)```\n((?: {4}.*\n)*)", (ROOT / page).read_text("utf-8"), re.DOTALL)
+    ((code, below),) = re.findall(
+        r"```python\n(.*?)```\n((?: {4}[^\n]*\n)*)", (ROOT / page).read_text("utf-8"), re.DOTALL
+    )
     assert code.count(ENDPOINT) == 1
     here = code.replace(ENDPOINT, hauling.endpoint).replace('"paper"', repr(NAME))
     ended = subprocess.run([sys.executable, "-c", here], capture_output=True, text=True, timeout=120, check=False)

@@ -10,7 +10,6 @@ from agents.config import MOST_LAG_S, AgentConfig, load_agent
 from agents.drivers.tables import DriverConfig
 from agents.estimation.ground import NOTHING_KNOWN
 from agents.estimation.plausibility import FAULTS
-from agents.estimation.powertrain import REASONS
 from agents.localisation.localiser import LocalisationConfig
 from agents.positioning import PipelineConfig
 from mapserver.trust.judgement import CLOCK_LIMIT_S
@@ -135,4 +134,6 @@ def test_page_of_ground_estimation_names_every_reason_and_none_else() -> None:
     assert not {reason for reason in reasons if f'"{reason}"' not in source}
     judged = (CONFIG.parent / "agents" / "estimation" / "plausibility.py").read_text(encoding="utf-8")
     given = set(re.findall(r'return "(\w+)"', judged)) | set(re.findall(r'_hold = "(\w+)"', judged))
-    assert given | FAULTS | REASONS | {NOTHING_KNOWN.reason, "settling"} == reasons
+    powertrain = (CONFIG.parent / "agents" / "estimation" / "powertrain.py").read_text(encoding="utf-8")
+    given |= set(re.findall(r'(?:unknown=|return |else )"(\w+)"', powertrain))
+    assert given | FAULTS | {NOTHING_KNOWN.reason, "settling"} == reasons

@@ -10,7 +10,7 @@ from mapserver.query.server_source import ServerSource
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import GroundChange
 from protocol.queries.requests import parse_query
-from tests.patience import PATIENCE_S
+from tests.patience import until
 from tests.unit.mapserver.data import past_of
 from tests.unit.records import machine_state
 
@@ -57,6 +57,9 @@ def answered(answers: AnswersOf, name: str, parameters: dict[str, str]) -> bytes
     if parameters.get("as_of") is None and name in ("segments", "worklist", "route", "way"):
         parameters = {"after": str(newest), **parameters}
     query, waited = parse_query(name, parameters), Future()
-    if answers.source.waits.add(query.after, query.wait_s, waited.set_result) and (error := waited.result(PATIENCE_S)):
-        raise error
+    waits = answers.source.waits
+    if waits.add(query.after, query.wait_s, waited.set_result):
+        until(lambda: waits.time_out() >= 0 and waited.done(), "the row, or the end of the wait")
+        if error := waited.result():
+            raise error
     return answers.answer(query)

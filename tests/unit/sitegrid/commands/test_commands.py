@@ -48,7 +48,7 @@ def test_sim_options_go_over_the_config(tmp_path: Path):
 def test_sim_records_log_folders_and_truth(tmp_path: Path, capsys):
     logs, truth = tmp_path / "logs", tmp_path / "truth"
     words = ["--record", str(logs), "--truth", str(truth), "--seconds", "2", "--machines", "2"]
-    assert main(["sim", *words]) == 0
+    assert main(["sim", "--json", *words]) == 0
     assert json.loads(capsys.readouterr().out)["machines"] == 2
     assert len(list(open_log(logs / "loader-2").readings())) > 300
     assert TruthMap.load(truth / "truth_map.npz").c_rr.shape == (150, 200)
