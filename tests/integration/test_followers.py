@@ -275,8 +275,7 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Quiet]:
 
 def test_a_follower_that_lacks_a_row_refuses_and_the_server_is_asked(quiet: Quiet):
     with quiet.run.connect() as client:
-        client.point(1.0, 1.0)
-        assert client.origin.follower == "near"
+        until(lambda: client.point(1.0, 1.0) and client.origin.follower == "near", "a follower's answer")
         with pytest.raises(QueryError, match=r"row 99 is not merged after 1\.5 s") as refused:
             client.ask(PointQuery(1.0, 1.0, after=99, wait_s=1.5))  # the server refuses last
         assert refused.value.reason == "after_timeout"

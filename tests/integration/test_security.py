@@ -171,8 +171,12 @@ def test_a_follower_with_keys_answers_under_its_own_name_alone(guarded: Guarded)
     follower.expect("ready", PATIENCE_S)
     with connect(guarded.endpoint, SITE, keys=guarded.keys / "guest") as client:
         row = client.info().journalled
-        assert client.ask(PointQuery(1.0, 1.0, after=row)).version.row == row
-        assert client.origin.follower == "reader-1", f"follower pid {follower.pid}"
+        until(
+            lambda: (
+                client.ask(PointQuery(1.0, 1.0, after=row)).version.row == row and client.origin.follower == "reader-1"
+            ),
+            "an answer of the follower",
+        )
         assert [one.name for one in client.followers()] == ["reader-1"]
     follower.stop()
 
