@@ -356,6 +356,9 @@ def test_a_store_that_replaces_another_learns_what_it_lacks():
     d.reply(Refused(Refusal.GAP, "", expected=1))  # accepted: it has none of the run
     sent = d.batch()
     assert (sent.first_seq, sent.lost_before, sent.store) == (6, 5, FIRST)
+    assert d.reply(Refused(Refusal.GAP, "", expected=3)) > 0, "a gap in what was declared lost says nothing"
+    assert d.uplink.counters["lowered_watermarks"] == 1
+    d.batch()
     d.reply(Ack(8, 1, store=SECOND, replaces=FIRST))
     assert d.counter("depth") == 0
     d.spool.record(ROWS[8:9])

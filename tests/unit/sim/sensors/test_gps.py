@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sim.sensors.gps import CommonDrift
 from sim.sensors.presets import Preset
 from sim.sensors.rigs import Rig
 from tests.unit.sim.sensor_rigs import (
@@ -63,6 +64,17 @@ def test_fully_shared_drift_is_one_whatever_the_rates_and_the_other_machines(
     same = abs(mixed[1][1::2] - mixed[0]).max() < 1e-6
     assert same == others_change_nothing_else
     assert abs(mixed[2] - mixed[0]).max() > 0.1
+
+
+def test_drift_is_the_same_in_pieces() -> None:
+    def drift() -> CommonDrift:
+        rngs = [np.random.default_rng(SEED + i) for i in range(2)]
+        return CommonDrift(rngs, np.array([0, 1, 1]), np.array([5.0, 5.0, 20.0]))
+
+    steps, pieces = np.arange(3, 301, 3), drift()
+    np.testing.assert_allclose(
+        np.concatenate([pieces.run(part) for part in np.split(steps, [7, 40])], 1), drift().run(steps)
+    )
 
 
 @pytest.mark.parametrize("rate_hz", [5, 10])
