@@ -19,7 +19,7 @@ from protocol.wire.codec import (
     encode_corrections,
     encode_offer,
 )
-from protocol.wire.fields import STORE_ID, pack, unpack
+from protocol.wire.fields import MAX_DEPTH, STORE_ID, pack, take_plain, unpack
 from protocol.wire.messages import VERSION, Ack, CalibrationOffer, Health, Pose, Refused, SampleBatch, SensorBundle
 from tests.golden import make as golden
 
@@ -351,3 +351,13 @@ def test_what_is_no_table_is_no_offer(table):
     ack = codec.decode_reply(codec.encode_reply(Ack(3, 1, store=STORE_ID, offer=table)))
     with pytest.raises(MessageError, match="map expected"):
         decode_offer(ack.offer)
+
+
+@pytest.mark.parametrize("nested", [lambda value: {"a": value}, lambda value: [value]])
+def test_plain_values_nest_as_deep_as_the_protocol_says(nested) -> None:
+    value = 1
+    for _ in range(MAX_DEPTH - 1):
+        value = nested(value)
+    assert take_plain({"values": {"a": value}}, "values") == {"a": value}
+    with pytest.raises(MessageError, match="nested more than 16 deep"):
+        take_plain({"values": {"a": nested(value)}}, "values")
