@@ -117,11 +117,12 @@ def _why(client: Client, _: WhyQuery, reasons: CellReasons) -> Answer:
     by = f"{reasons.metres:.3g} m driven by {', '.join(reasons.machines)}, last at {utc_text(reasons.newest_ns)}"
     changed = f"changed at {utc_text(reasons.changed_ns)}" if reasons.changed_ns else "no change of the ground"
     kinds = _names_of_classes(client)
+    columns = {"now": reasons.values} | ({"before the change": reasons.before} if reasons.changed_ns else {})
     rows = [
-        [name, _worded(name, _nan(value), kinds), _worded(name, _nan(reasons.before.get(name)), kinds)]
-        for name, value in reasons.values.items()
+        [name, *(_worded(name, _nan(column.get(name)), kinds) for column in columns.values())]
+        for name in reasons.values
     ]
-    values = _table(["", "now", "before the change"], rows if reasons.changed_ns else [[*row[:2], ""] for row in rows])
+    values = _table(["", *columns], rows)
     votes = zip(reasons.resistance.centres, reasons.resistance.votes, reasons.resistance.before, strict=True)
     held = [[f"{at:.4f}", f"{now:.3g}", f"{old:.3g}"] for at, now, old in votes if now or old]
     return reasons, [f"{place}: {by}; {changed}", *values, *_table(["votes: c_rr", "m", "m before"], held)]

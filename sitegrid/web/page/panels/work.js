@@ -20,7 +20,7 @@ const ASIDE_PX = [[0, 0], [0, -22], [0, 22], [24, 0], [-24, 0], [24, -22], [-24,
 const NO_ROADS = "No roads are known yet. They appear where machines drive over the same ground again.";
 const GUESSED = "No machine said what it weighs where a number has a ~: what is lost there is a guess.";
 const TIES = "Those that cost nearly the same may stand in either order.";
-// target: resistance of good ground. hours: of traffic. lit: the stretch that is pointed at, on map and list.
+// target: resistance of good ground. hours: of traffic. lit: the section pointed at, on map and list.
 export const work = { target: 0.02, rows: [], changes: [], hours: 0, lit: null };
 const small = (text) => element("small", {}, text), bold = (text) => element("b", {}, text);
 
