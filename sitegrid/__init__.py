@@ -1,7 +1,9 @@
 """sitegrid: many machines on a construction site draw one map of the ground together.
 
-with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
-    ground = site.region((0, 0, 200, 150), ["resistance"])
+Ask the map server of a site::
+
+    with sitegrid.connect("tcp/127.0.0.1:7447", "paper") as site:
+        ground = site.region((0, 0, 200, 150), ["resistance"])
 """
 
 TYPE_CHECKING = False  # like `typing.TYPE_CHECKING`, without importing `typing`
