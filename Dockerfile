@@ -26,7 +26,7 @@ FROM build AS build-server
 RUN $INSTALL ".[postgres,security,server,web]"
 WORKDIR /venv/lib/python3.11/site-packages
 RUN find . -type d -name tests -prune -exec rm -r {} + \
-    && rm -r pyarrow/include pyarrow/*flight* pyarrow/*substrait* pyarrow/*_s3* \
+    && rm -r pyarrow/include pyarrow/*flight* pyarrow/_substrait* pyarrow/*_s3* \
     scipy/integrate scipy/interpolate scipy/io scipy/signal scipy/stats
 # Kernels for any processor of this kind: one that differs from the builder's would compile them anew.
 ENV NUMBA_CPU_NAME=generic
