@@ -29,7 +29,8 @@ from protocol.site.ground_classes import SLOPE, UNKNOWN, ZONES, resistance_class
 
 DPI, PANEL_IN = 110, 3.1
 STYLE: Any = {"figure.constrained_layout.use": True, "font.size": 9, "legend.frameon": False, "savefig.bbox": "tight"}
-ZONE_RGB: Floats = np.array([zone.bgr[::-1] for zone in ZONES]) / 255  # the server's colours
+# The paper's colours, as its pictures are compared; green, red, black, yellow, blue for ZONES.
+ZONE_RGB: Floats = np.array([(40, 160, 60), (215, 40, 40), (35, 35, 35), (250, 215, 40), (30, 95, 205)]) / 255
 GRADE_RGB = ZONE_RGB[:2]  # flat and slope, as in the paper
 UNKNOWN_RGB = (0.88, 0.88, 0.88)
 BEHIND_RGB, WRONG_RGB = (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)  # of difference maps: not plotted, wrong

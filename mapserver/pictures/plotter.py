@@ -23,17 +23,8 @@ Box = tuple[int, int, int, int]  # left, top, right, bottom [px]
 MAX_SIDE_PX, MAX_AREA_PX, MAX_CELL_PX = 1240, 800_000, 64  # limits of the ground, without margins
 ARROW_SPACING_PX = 34
 UNKNOWN_COLOUR, WRONG_COLOUR = (228, 228, 228), (255, 0, 255)
-EASY, HARD = (119, 55, 36), (92, 221, 251)  # ends of the live page's scale: dark blue, yellow
-
-
-def _ordered(c_rr: float) -> Colour:
-    """The colour of a rolling resistance between EASY and HARD, in its logarithm, as on the live page."""
-    share = math.log(c_rr / ZONES[0].c_rr) / math.log(ZONES[-1].c_rr / ZONES[0].c_rr)
-    blue, green, red = (round(easy + share * (hard - easy)) for easy, hard in zip(EASY, HARD, strict=True))
-    return blue, green, red
-
-
-GROUND_COLOURS = tuple(_ordered(zone.c_rr) for zone in ZONES)
+GROUND_COLOURS = tuple(zone.bgr for zone in ZONES)
+EASY, HARD = GROUND_COLOURS[0], GROUND_COLOURS[-1]
 # bright, unlike any ground; a dark edge separates them from pale ground
 TRACK_COLOURS: tuple[Colour, ...] = (
     (255, 255, 255), (255, 240, 0), (0, 150, 255), (255, 110, 255), (170, 255, 170), (255, 190, 150), (150, 190, 255),

@@ -1,4 +1,4 @@
-"""The paper's kinds of ground: names, coefficients, colours, and classes of cells."""
+"""The paper's kinds of ground: names and coefficients; colours, and classes of cells."""
 
 import math
 from dataclasses import dataclass
@@ -12,19 +12,20 @@ UNKNOWN = -1  # a cell without samples
 
 @dataclass(frozen=True)
 class Zone:
-    """A kind of ground: rolling resistance [-], colour in the paper's pictures."""
+    """A kind of ground: rolling resistance [-], colour on maps."""
 
     name: str
     c_rr: float
     bgr: tuple[int, int, int]
 
 
+# Dark blue to yellow in even steps of the page's ordered palette: the paper's red gravel looks like bad ground.
 ZONES = (
-    Zone("dry concrete", 0.008, (60, 160, 40)),
-    Zone("gravel", 0.02, (40, 40, 215)),
-    Zone("dry dirt", 0.04, (35, 35, 35)),
-    Zone("wet dirt", 0.06, (40, 215, 250)),
-    Zone("sand", 0.25, (205, 95, 30)),
+    Zone("dry concrete", 0.008, (119, 55, 36)),
+    Zone("gravel", 0.02, (134, 90, 70)),
+    Zone("dry dirt", 0.04, (141, 139, 130)),
+    Zone("wet dirt", 0.06, (126, 172, 170)),
+    Zone("sand", 0.25, (92, 221, 251)),
 )
 BOUNDARIES = (0.014, 0.03, 0.05, 0.155)  # midway between neighbouring coefficients
 
