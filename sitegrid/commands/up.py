@@ -82,10 +82,11 @@ def _start(folder: Folder, site: str, children: Children) -> tuple[str, str, lis
         page = 0
         note(f"port {PAGE} is taken: the page takes another one")
     at, site_file = ("--endpoint", endpoint), ("--site-file", folder.site_file)
+    beneath = ("--config", folder.page_file) if folder.page_file.exists() else ()  # outline, base map
     parts = {
         "router": ("--listen", endpoint),
         "server": (*at, *site_file, "--store", folder.store),
-        "web": (*at, "--site", site, "--listen", page),
+        "web": (*at, "--site", site, "--listen", page, *beneath),
         "agent": (*at, *site_file, "--config", folder.agent_file, "--spool", folder.spool),
     }
     running, url = list[Child](), ""

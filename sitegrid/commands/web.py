@@ -23,6 +23,8 @@ def add_options(parser: ArgumentParser) -> None:
     add_network(parser)
     sites = "a site to show; with =ENDPOINT, by another router; may be repeated (default: that of the keys, else paper)"
     add("--site", type=_site, action="append", metavar="NAME[=ENDPOINT]", dest="sites", help=sites)
+    beneath = "outline and base map of each site, as in config/web.toml"
+    add("--config", type=Path, metavar="FILE", help=beneath)
     usual = ("127.0.0.1", 8080)
     listen = "address to listen on; port 0 takes a free one (default 127.0.0.1:8080)"
     add("--listen", type=address, default=usual, metavar="[HOST:]PORT", help=listen)

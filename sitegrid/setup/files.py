@@ -51,7 +51,7 @@ class Folder:
 
     def __init__(self, path: Path) -> None:
         self.path, self.logs = path, path / "logs"
-        self.site_file, self.agent_file = path / "site.toml", path / "agent.toml"
+        self.site_file, self.agent_file, self.page_file = (path / f"{name}.toml" for name in ("site", "agent", "web"))
         self.store, self.spool = path / "store", path / "spool.db"
 
     def load(self) -> tuple[SiteConfig, MachineConfig, AgentConfig]:

@@ -7,7 +7,7 @@ import contextlib
 import json
 import logging
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Collection, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
@@ -28,6 +28,7 @@ from protocol.queries.answers import MapInfo, MapVersion
 from protocol.queries.requests import RegionQuery
 from protocol.site.geometry import Bounds
 from sitegrid.web import live, values
+from sitegrid.web.backdrop import Backdrop, BackdropConfig
 from sitegrid.web.encoding import Cache, as_json, beside
 from sitegrid.web.guard import Guard
 from sitegrid.web.openapi import PREFIX, description
@@ -46,7 +47,7 @@ log = logging.getLogger("sitegrid.web")
 
 
 class WebApp:
-    """All sites and their routes. person, counts, names: see Guard."""
+    """All sites and their routes. backdrops: by site. person, counts, names: see Guard."""
 
     def __init__(
         self,
@@ -54,8 +55,10 @@ class WebApp:
         person: Callable[[str], str | None] | None,
         counts: Counter[str],
         names: Collection[str],
+        backdrops: Mapping[str, Backdrop],
     ) -> None:
         self._feeds = {feed.name: feed for feed in feeds}
+        self._backdrops = {name: backdrops.get(name, Backdrop(BackdropConfig())) for name in self._feeds}
         self._pngs: Cache[bytes] = Cache(PNG_BYTES, len)
         site = f"{PREFIX}/sites/{{site}}"
         routes = [
@@ -63,6 +66,8 @@ class WebApp:
             Route(f"{PREFIX}/openapi.json", self._openapi),
             *(Route(f"{site}/{name}", self._resource, name=name) for name in RESOURCES),
             WebSocketRoute(f"{site}/live", self._live),
+            Route(f"{site}/backdrop", self._backdrop),
+            Route(f"{site}/base_map", self._base_map),
             Route(f"{site}/xyz/{{layer}}.json", self._tilejson),
             Route(f"{site}/xyz/{{kind}}/{{layer}}/{{z:int}}/{{x:int}}/{{y:int}}.png", self._xyz),
             Route("/healthz", self._healthz),
@@ -72,7 +77,8 @@ class WebApp:
         handlers: dict[Any, Any] = {HTTPException: _not_there, Exception: _failed}
         app = Starlette(routes=routes, exception_handlers=handlers, lifespan=self._lifespan)
         app.add_middleware(GZipMiddleware, minimum_size=1000, compresslevel=5, exclude_content_types=SMALL_ALREADY)
-        self.guard = Guard(app, person, counts, names)
+        sources = sorted({one.source for one in self._backdrops.values() if one.source})
+        self.guard = Guard(app, person, counts, names, sources)
         self.app: ASGIApp = self.guard
 
     @contextlib.asynccontextmanager
@@ -120,6 +126,24 @@ class WebApp:
             await socket.close(4404, "unknown site")
             return
         await live.serve(socket, self._feed(socket))
+
+    async def _backdrop(self, request: Request) -> Response:
+        """What the page draws beneath the map."""
+        try:
+            feed = self._feed(request)
+            info, projection = await feed.info(), await feed.projection()
+            picture = f"{PREFIX}/sites/{feed.name}/base_map"
+            return _json(self._backdrops[feed.name].described(info.site, projection, picture))
+        except Exception as error:
+            return _failed(request, error)
+
+    async def _base_map(self, request: Request) -> Response:
+        """The base map's picture."""
+        try:
+            picture = self._backdrops[self._feed(request).name].picture
+        except RequestProblem as error:
+            return problem_response(error)
+        return FileResponse(picture) if picture else _not_there(request, HTTPException(HTTPStatus.NOT_FOUND))
 
     async def _tilejson(self, request: Request) -> Response:
         """TileJSON of a layer, as colours or values."""

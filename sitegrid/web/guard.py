@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from ipaddress import ip_address
@@ -24,11 +24,11 @@ ADDRESSES = 4096  # known rates; the longest silent address is forgotten first
 MAX_PATH, MAX_QUERY = 1024, 32_768  # bytes of path and parameters: a polygon of 1000 corners
 OPEN_PATHS = ("/healthz",)  # reveal nothing of a site; monitoring has no token, and uses any name
 _HOST = re.compile(r"(\[[^][]*\]|[^][:@/?#]*)(:\d*)?")  # Host header: name or address, and port
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'; img-src 'self' data: blob:"
+)
 HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data: blob:; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -38,12 +38,20 @@ HEADERS = {
 class Guard:
     """Middleware. person: a token's person or None; without it everybody is admitted.
 
-    counts: requests and refusals, of sockets too. names: of this server, lower case.
+    counts: requests and refusals, of sockets too. names: of this server, lower case. pictures: where pages may load
+    pictures from, besides here.
     """
 
     def __init__(
-        self, app: ASGIApp, person: Callable[[str], str | None] | None, counts: Counter[str], names: Collection[str]
+        self,
+        app: ASGIApp,
+        person: Callable[[str], str | None] | None,
+        counts: Counter[str],
+        names: Collection[str],
+        pictures: Iterable[str] = (),
     ) -> None:
+        headers = {**HEADERS, "Content-Security-Policy": " ".join([POLICY, *pictures])}
+        self._headers = [(name.lower().encode(), value.encode()) for name, value in headers.items()]
         self._app, self._person, self._names = app, person, frozenset(names) | {"localhost"}
         self._rates: OrderedDict[str, tuple[float, float]] = OrderedDict()
         self.counts = counts
@@ -67,8 +75,7 @@ class Guard:
         async def guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
                 self.counts[f"status_{message['status']}"] += 1
-                headers = message.setdefault("headers", [])
-                headers += [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
+                message.setdefault("headers", []).extend(self._headers)
             await send(message)
 
         await self._app(scope, receive, guarded)

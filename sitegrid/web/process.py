@@ -25,6 +25,7 @@ from sitegrid.client import Client, connect
 from sitegrid.process.supervisor import say_ready, until
 from sitegrid.security.tokens import TokenFile
 from sitegrid.web.app import WebApp
+from sitegrid.web.backdrop import load_backdrops
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.sockets import AT_ONCE, OF_ADDRESS, Listening, listen
 from sitegrid.web.values import RequestProblem, problem_response
@@ -50,12 +51,16 @@ def serve(
     listening = opened.enter_context(listen(address))
     person = TokenFile(arguments.tokens).person if arguments.tokens else None
     secured = _tls(arguments.tls)
+    backdrops = load_backdrops(arguments.config) if arguments.config else {}
     names = {name.lower() for name in (address[0], socket.gethostname(), *arguments.hosts)}
     clients: list[Client] = []
     for name, endpoint in sites:
         if (client := _connected(endpoint, name, arguments.keys, stop)) is None:
             return 0
         clients.append(client)
+    shown = [client.site for client in clients]
+    if others := sorted(set(backdrops) - set(shown)):
+        raise ConfigError(arguments.config, f"site `{others[0]}` is not shown; shown: {', '.join(shown)}")
 
     logging.getLogger("uvicorn.error").addFilter(_without_traceback)
 
@@ -64,7 +69,7 @@ def serve(
             sslproto.SSLProtocol.max_size = TLS_BYTES
             loop: Any = asyncio.get_running_loop()
             loop.create_server = partial(loop.create_server, ssl_handshake_timeout=TLS_S, ssl_shutdown_timeout=TLS_S)
-        web = WebApp([SiteFeed(client) for client in clients], person, listening.counts, names)
+        web = WebApp([SiteFeed(client) for client in clients], person, listening.counts, names, backdrops)
         config = uvicorn.Config(
             web.app,
             http=partial(PatientProtocol, listening),  # type: ignore[arg-type] # a factory
@@ -83,7 +88,7 @@ def serve(
         watch = asyncio.create_task(_stop_with(server, stop))
         scheme, (host, port) = "https" if arguments.tls else "http", listening.getsockname()[:2]
         url = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
-        say_ready({"ready": "web", "url": url, "sites": [client.site for client in clients]})
+        say_ready({"ready": "web", "url": url, "sites": shown})
         await server._serve([listening])  # noqa: SLF001 - `serve` would take the signals that stop_flag has
         stop.set()
         await watch

@@ -98,7 +98,7 @@ def _server() -> tuple[asyncio.AbstractEventLoop, Config]:
 
     loop, feed = asyncio.new_event_loop(), SiteFeed(_NoServer())  # type: ignore[arg-type]
     feed._follow = nothing  # type: ignore[method-assign]
-    app = WebApp([feed], None, Counter(), ("localhost",)).app
+    app = WebApp([feed], None, Counter(), ("localhost",), {}).app
     config = Config(app, ws="websockets-sansio", ws_max_size=4096, log_config=None, lifespan="off")
     config.load()
     return loop, config

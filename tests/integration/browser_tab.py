@@ -5,11 +5,11 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.paths import ROOT
 from tests.patience import PATIENCE_S
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -77,12 +77,12 @@ class Tab:
         left, top = self.js(f"sitegrid.view.toScreen({x_m}, {y_m})")
         return left, top
 
-    def serious_faults(self, axe: str) -> list[Any]:
+    def faults(self, axe: str) -> list[Any]:
         """axe's findings on a page loaded without its script rules."""
         self.until("document.getAnimations().every((one) => one.playState !== 'running')")
         self.page.evaluate(axe)
         script = "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
-        return [fault for fault in self.page.evaluate(script) if fault[1] in ("serious", "critical")]
+        return list(self.page.evaluate(script))
 
     def close(self) -> None:
         self.context.close()
@@ -97,12 +97,14 @@ def watched(browser: Any, url: str) -> Iterator[Tab]:
     tab.close()
 
 
-def axe_script(folder: Path) -> str:
-    """axe-core from npm, or skip."""
-    npm = shutil.which("npm")
-    if npm is None:
-        pytest.skip("no npm: axe-core is installed by it")
-    command = [npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(folder), "axe-core"]
-    if subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False).returncode:
-        pytest.skip("axe-core cannot be installed here")
-    return (folder / "node_modules" / "axe-core" / "axe.min.js").read_text()
+def axe_script() -> str:
+    """axe-core, as pinned beside eslint; npm installs it, or skip."""
+    folder, npm = ROOT / "tests" / "page", shutil.which("npm")
+    script = folder / "node_modules" / "axe-core" / "axe.min.js"
+    if not script.exists():
+        if npm is None:
+            pytest.skip("no npm: axe-core is installed by it")
+        command = [npm, "ci", "--silent", "--no-audit", "--no-fund", "--prefix", str(folder)]
+        if subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False).returncode:
+            pytest.skip("axe-core cannot be installed here")
+    return script.read_text(encoding="utf-8")

@@ -54,12 +54,14 @@ class Pixels:
 
 def pixels_of(z: int, x: int, y: int, projection: Projection) -> Pixels:
     """Pixel centres of a tile."""
-    n = 2**z * SIDE_PX
-    lon_deg = (x * SIDE_PX + np.arange(SIDE_PX) + 0.5) / n * 360.0 - 180.0
-    north = math.pi * (1 - 2 * (y * SIDE_PX + np.arange(SIDE_PX) + 0.5) / n)
-    lat_deg = np.degrees(np.arctan(np.sinh(north)))
-    lon, lat = np.meshgrid(lon_deg, lat_deg)
-    return Pixels(*projection.to_map_many(lat, lon))
+    centres = (np.arange(SIDE_PX) + 0.5) / SIDE_PX
+    u, v = np.meshgrid((x + centres) / 2**z, (y + centres) / 2**z)
+    return Pixels(*projection.to_map_many(*places_at(u, v)))
+
+
+def places_at(u: Floats, v: Floats) -> tuple[Floats, Floats]:
+    """Latitudes, longitudes [deg] of places on the world's tile, 0 to 1 from the west and from the north."""
+    return np.degrees(np.arctan(np.sinh(math.pi * (1 - 2 * v)))), u * 360.0 - 180.0
 
 
 def tiles_at(lat_deg: Floats, lon_deg: Floats, z: int) -> tuple[Floats, Floats]:

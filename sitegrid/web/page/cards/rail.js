@@ -4,7 +4,7 @@ import { LAYERS } from "../layers.js";
 import { choices } from "../state/index.js";
 
 export const SHOWS = [["machines", "Machines", "M"], ["tracks", "Tracks, last minute", "T"],
-  ["changes", "Changed ground", "G"], ["lanes", "Lanes", "N"], ["plan", "Site picture", "P"],
+  ["changes", "Changed ground", "G"], ["lanes", "Lanes", "N"], ["base", "Base map", "P"],
   ["unsure", "Fade uncertain", "U"], ["old", "Fade old", "O"]];
 
 export function buildRail() {

@@ -9,6 +9,7 @@ const DAYS = [1, 2, 7, 14, 28, 56, 91, 364].map((days) => days * DAY_NS);
 const MINUTES = [1, 2, 3, 5, 10, 15, 30, 60, 120, 180, 360, 720].map((minutes) => minutes * 60e9);
 const TICKS_NS = [10e9, 30e9, ...MINUTES, ...DAYS];
 const PLAY = "M6 4l10 6-10 6z", PAUSE = "M5 4h4v12H5zM11 4h4v12h-4z";
+const NEXT = { one: "Side by side", beside: "Difference", difference: "One time" }; // by mode: what the button does
 const slider = byId("slider"), second = byId("slider-two");
 
 export function buildTimebar() {
@@ -28,8 +29,7 @@ export function showTimebar() {
   slider.setAttribute("aria-valuetext", ns ? `${day(ns)} ${clock(ns)} UTC` : "no time known");
   second.hidden = mode === "one";
   if (other !== null && times.step_ns) second.value = times.stepOf(other);
-  byId("compare").textContent = { one: "Compare", beside: "Side by side", difference: "Difference" }[mode];
-  byId("compare").setAttribute("aria-pressed", mode !== "one");
+  byId("compare").textContent = NEXT[mode];
   byId("live").setAttribute("aria-pressed", at === null);
   byId("play").setAttribute("aria-label", times.playing ? "Pause" : "Play");
   byId("play").querySelector("path").setAttribute("d", times.playing ? PAUSE : PLAY);

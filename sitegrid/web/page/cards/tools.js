@@ -2,7 +2,7 @@
 import { byId } from "../elements.js";
 import { showHelp } from "../keys.js";
 import { copyLink } from "../link.js";
-import { readPlan } from "../map/plan.js";
+import { readPicture } from "../map/base_map.js";
 import { fit } from "../map/sight.js";
 import { choices } from "../state/index.js";
 import { say } from "./notice.js";
@@ -16,7 +16,7 @@ export function buildTools() {
   const does = { fit, theme: () => choices.toggleTheme(), keys: showHelp, link, plan: () => file.click() };
   for (const [name, act] of Object.entries(does)) byId(name).onclick = act;
   file.onchange = async () => {
-    await readPlan([...file.files]).catch((error) => say("This picture cannot be shown", error.message));
+    await readPicture([...file.files]).catch((error) => say("This picture cannot be shown", error.message));
     file.value = "";
   };
 }

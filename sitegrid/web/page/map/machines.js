@@ -11,8 +11,7 @@ const areShown = () => choices.shows.machines && times.at === null;
 
 export function drawMachines(context) {
   if (!areShown()) return;
-  const labels = []; // a label keeps off those that are drawn already
-  for (const machine of site.machines.values()) drawMachine(context, machine, labels);
+  for (const machine of site.machines.values()) drawMachine(context, machine);
 }
 
 // The machine that is drawn there; undefined for none.
@@ -23,7 +22,7 @@ export function machineAt(left, top) {
   return near.sort((a, b) => away(a) - away(b))[0]?.machine;
 }
 
-function drawMachine(context, machine, labels) {
+function drawMachine(context, machine) {
   const { ink } = choices, now_s = performance.now() / 1000, isTrusted = site.trusted[machine.machine] !== false;
   const isSilent = site.isSilent(machine), isGrey = isSilent || !isTrusted;
   const place = view.toScreen(machine.x_m, machine.y_m);
@@ -32,7 +31,7 @@ function drawMachine(context, machine, labels) {
   drawArrow(context, machine, place, isGrey ? ink.faint : ink.text);
   const fault = machine.faults?.[0] ?? "";
   const state = !isTrusted ? "not used" : isSilent ? `silent ${span(now_s - machine.seen_s)}` : cut(fault);
-  drawLabel(context, state ? `${machine.machine} · ${state}` : machine.machine, place, labels, isGrey);
+  drawLabel(context, state ? `${machine.machine} · ${state}` : machine.machine, place, isGrey);
 }
 
 const cut = (text) => (text.length > LABEL_CHARS ? `${text.slice(0, LABEL_CHARS - 1)}…` : text);
@@ -78,11 +77,13 @@ function drawArrow(context, machine, [x, y], colour) {
   context.restore();
 }
 
-// A label stays right of where the rail ends, if its machine is.
-function drawLabel(context, text, [left, middle], labels, isGrey) {
+// A label is right of where the rail ends, and left of where the window does, if its machine is. It covers no other
+// label and no number of the panel's; a machine without room for one has none.
+function drawLabel(context, text, [left, middle], isGrey) {
   const { ink } = choices, edge = view.margins[0] - 16, width = textWidth(context, text) + 14;
-  const x = left > edge ? Math.max(left, edge + width / 2) : left;
-  const places = [-20, 22, -42, 44, -64].map((away) => [x, middle + away]);
+  const isInside = left > edge && left < view.width;
+  const x = isInside ? Math.max(edge + width / 2, Math.min(left, view.width - width / 2 - 4)) : left;
+  const place = freePlace([-20, 22, -42, 44, -64, 66].map((away) => [x, middle + away]), width);
   const style = { face: ink.surface, colour: isGrey ? ink.soft : ink.text, alpha: 0.94 };
-  drawPlate(context, text, freePlace(places, width, labels) ?? places[0], width, labels, style);
+  if (place) drawPlate(context, text, place, width, style);
 }

@@ -3,6 +3,8 @@ import { choices, view } from "../state/index.js";
 
 const PLATE_PX = 20, APART_PX = 21; // height of a plate; of the middles of two that stand above each other
 
+const plates = []; // of this picture: {x, y, width}
+
 export const ratio = () => Math.min(2, devicePixelRatio || 1); // pixels of a canvas in one of the page's
 
 // A canvas made anew so large; its context is in the page's pixels.
@@ -48,7 +50,18 @@ export function drawPlace(context, place, name, pointed = false) {
   context.fillStyle = pointed ? ink.alarm : name ? ink.accent : ink.surface;
   context.fill();
   if (!pointed && !name) stroke(context, ink.accent, 2.5);
-  if (name) write(context, name, x, y, ink.surface);
+  if (!name) return;
+  plates.push({ x, y, width: PLATE_PX });
+  write(context, name, x, y, ink.surface);
+}
+
+// A picture by its corners on the canvas: north-west, north-east, south-west.
+export function drawPicture(context, image, [[x, y], [east, eastY], [south, southY]]) {
+  const { width, height } = image;
+  context.save();
+  context.transform((east - x) / width, (eastY - y) / width, (south - x) / height, (southY - y) / height, x, y);
+  context.drawImage(image, 0, 0);
+  context.restore();
 }
 
 function write(context, text, x, y, colour) {
@@ -63,14 +76,16 @@ export function textWidth(context, text) {
   return context.measureText(text).width;
 }
 
-// The first of places [x, y] where a plate of that width keeps off those in `taken`; undefined where none does.
-export const freePlace = (places, width, taken) =>
-  places.find(([x, y]) => taken.every((other) =>
+export const clearPlates = () => { plates.length = 0; };
+
+// The first of places [x, y] where a plate of that width keeps off those of the picture; undefined where none does.
+export const freePlace = (places, width) =>
+  places.find(([x, y]) => plates.every((other) =>
     Math.abs(y - other.y) > APART_PX || Math.abs(x - other.x) > (width + other.width) / 2 + 1));
 
-// Words on a plate, which is added to `taken`.
-export function drawPlate(context, text, [x, y], width, taken, { face, colour, halo = null, alpha = 1 }) {
-  taken.push({ x, y, width });
+// Words on a plate.
+export function drawPlate(context, text, [x, y], width, { face, colour, halo = null, alpha = 1 }) {
+  plates.push({ x, y, width });
   context.beginPath();
   context.roundRect(x - width / 2, y - PLATE_PX / 2, width, PLATE_PX, 6);
   if (halo) stroke(context, halo, 2, 0.9);

@@ -4,19 +4,19 @@ import { panel } from "../cards/panel.js";
 import { showScale } from "../cards/scale.js";
 import { showSides } from "../cards/sides.js";
 import { site, view } from "../state/index.js";
+import { drawBaseMap, drawOutline } from "./base_map.js";
 import { drawChanges } from "./changes.js";
 import { drawCross } from "./cross.js";
 import { drawGround } from "./ground.js";
 import { drawMachines } from "./machines.js";
 import { drawLanes } from "./lanes.js";
-import { ratio } from "./pen.js";
-import { drawPlan } from "./plan.js";
+import { clearPlates, ratio } from "./pen.js";
 import { drawTiles } from "./tiles.js";
 
 export const canvas = byId("map");
 const drawPanel = (context) => panel.shown?.draw?.(context);
 // Layers, from the ground up: those of cells are drawn pixel by pixel, the others in the page's units.
-const LAYERS = [[drawGround, true], [drawPlan], [drawTiles, true],
+const LAYERS = [[drawGround, true], [drawBaseMap, true], [drawOutline], [drawTiles, true],
   ...[drawLanes, drawChanges, drawPanel, drawMachines, drawCross].map((draw) => [draw])];
 
 let isDirty = true;
@@ -34,6 +34,7 @@ export function drawFrame() {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
   view.size(innerWidth, innerHeight);
   isDirty = false;
+  clearPlates();
   const context = canvas.getContext("2d", { alpha: false });
   for (const [draw, isPixels] of LAYERS) {
     const scale = isPixels ? 1 : ratio();

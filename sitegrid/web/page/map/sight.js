@@ -22,7 +22,8 @@ function groundAndMachines(room_m) {
 export function fit() {
   view.size(innerWidth, innerHeight); // before the first picture too
   fitted = groundAndMachines(ROOM_M);
-  view.fit(fitted ?? NOTHING, margins(panel.shown?.wholeSite));
+  const outline = around((site.backdrop?.outline ?? []).flat().map(([x, y]) => [x, y, x, y]));
+  view.fit(fitted ?? outline ?? NOTHING, margins(panel.shown?.wholeSite));
 }
 
 export function fitUnlessMoved() { if (!view.moved) fit(); }

@@ -139,7 +139,7 @@ function changed() {
 }
 
 export function draw(context) {
-  const { rows, changes, lit } = work, { ink } = choices, taken = [];
+  const { rows, changes, lit } = work, { ink } = choices;
   const shown = rows.map(({ segment: { id, line } }, i) => ({ id, line, text: `${i + 1}` }));
   const change = shown.some(({ id }) => id === lit) ? undefined : changes.find(({ id }) => id === lit);
   if (change) shown.push({ ...change, text: change.after < change.before ? "repaired" : "worse" });
@@ -147,15 +147,15 @@ export function draw(context) {
   const colour = ({ id }) => (id === lit ? ink.alarm : ink.text);
   for (const one of shown) drawLine(context, one.line, colour(one), one.id === lit ? 7 : 4);
   const style = (one) => ({ face: colour(one), colour: ink.surface, halo: ink.halo });
-  for (const one of shown.reverse()) drawNumber(context, one, style(one), taken);
+  for (const one of shown.reverse()) drawNumber(context, one, style(one));
 }
 
-// It keeps off those in `taken`, and off the map where none of its places is free.
-function drawNumber(context, { line, text }, style, taken) {
+// It keeps off the others, and off the map where none of its places is free.
+function drawNumber(context, { line, text }, style) {
   const width = Math.max(20, textWidth(context, text) + 12), middle = line[Math.floor(line.length / 2)];
   const [x, y] = view.toScreen(...middle);
-  const place = freePlace(ASIDE_PX.map(([right, down]) => [x + right, y + down]), width, taken);
-  if (place) drawPlate(context, text, place, width, taken, style);
+  const place = freePlace(ASIDE_PX.map(([right, down]) => [x + right, y + down]), width);
+  if (place) drawPlate(context, text, place, width, style);
 }
 
 // A click on a stretch lights it in the list.

@@ -3,7 +3,8 @@ import { kindAt } from "../colours.js";
 import { LAYERS } from "../layers.js";
 import { Owner, keep, kept, parameter } from "./owner.js";
 
-const INKS = ["ground", "face", "hatch", "text", "soft", "faint", "accent", "halo", "driven", "alarm", "surface"];
+const INKS = ["ground", "face", "hatch", "text", "soft", "faint", "accent", "halo", "driven", "alarm", "surface",
+  "beneath"];
 const root = document.documentElement;
 
 // Tells of "layer" (or palette), "shows", "theme" and "paper".
@@ -11,7 +12,7 @@ class Choices extends Owner {
   #chosen = LAYERS.find((layer) => layer.id === parameter("layer"));
   layer = this.#chosen ?? LAYERS[0];
   palette = parameter("palette") ?? "ordered";
-  shows = { machines: true, tracks: true, changes: true, lanes: false, plan: true, unsure: true, old: false };
+  shows = { machines: true, tracks: true, changes: true, lanes: false, base: true, unsure: true, old: false };
   ink = {}; // the style sheet's colours, for what is drawn
 
   get hasKinds() { return this.palette === "kinds" && this.layer.id === "resistance"; }

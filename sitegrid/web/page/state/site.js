@@ -8,7 +8,7 @@ const TRACK_S = 60; // of a machine's places that are kept
 const SILENT_S = 8; // without a word, as in the map server
 const now_s = () => performance.now() / 1000;
 
-// Tells of "sites", "state", "map" (new tiles), "poses" and "facts" (changes, trust, times).
+// Tells of "sites", "state", "map" (new tiles), "poses", "facts" (changes, trust, times) and "backdrop".
 class Site extends Owner {
   name = "";
   names = [];
@@ -18,6 +18,7 @@ class Site extends Owner {
   changes = [];
   boundaries = []; // of rolling resistance, between the kinds of ground
   trusted = {};
+  backdrop = null; // outline and base map of the site, once the page's server has said them
   first_ns = 0;
   stamp_ns = 0;
 
@@ -45,7 +46,19 @@ class Site extends Owner {
 
   isSilent(machine) { return now_s() - machine.seen_s > SILENT_S; }
 
-  #turn(state) { if (state !== this.state) this.become("state", { state }); }
+  #turn(state) {
+    if (state === this.state) return;
+    this.become("state", { state });
+    if (state === "live" && !this.backdrop) this.#askBackdrop();
+  }
+
+  async #askBackdrop() {
+    try {
+      this.become("backdrop", { backdrop: await getJson(this.path("backdrop")) });
+    } catch (error) { // while the map server is away, it is asked again once it is back
+      if (error.status < 500) this.become("backdrop", { backdrop: { outline: [], problem: error.message } });
+    }
+  }
 
   #takeFrame(frame) {
     this.map.take(frame);
