@@ -15,7 +15,7 @@ export function showLegend() {
   palettes.hidden = layer.id !== "resistance";
   byId("legend").replaceChildren(heading(layer, differs), histogram(layer, differs, counts),
     element("div", { className: "ticks" }, layer.ticks.map(tick)), !differs && choices.hasKinds ? kinds() : "",
-    unknown(differs), palettes);
+    ...unknown(differs), palettes);
   const area = `${Math.round(known * site.map.cell_m ** 2).toLocaleString("en")} m² known`;
   byId("known").textContent = known ? `${area}${differs ? " at both times" : ""}` : "";
 }
@@ -46,6 +46,7 @@ const kinds = () => element("ul", { className: "kinds" }, KINDS.map(({ name, rgb
   element("li", {}, swatch(css(rgb)), name, element("span", {}, short(value)))));
 
 function unknown(differs) {
-  const driven = differs ? [" at one of the times"] : [element("i", { className: "driven" }), "Driven, not measured"];
-  return element("p", { className: "unknown" }, element("i", {}), "Unknown", ...driven);
+  const line = (className, words) => element("p", { className: "unknown" }, element("i", { className }), words);
+  if (differs) return [line("", "Unknown at one of the times")];
+  return [line("", "Unknown"), line("driven", "Driven, not measured")];
 }

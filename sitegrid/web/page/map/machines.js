@@ -1,7 +1,7 @@
 // A layer of the map: machines as arrows with names, where they were, and how well they know where they are.
 import { choices, site, times, view } from "../state/index.js";
 import { span } from "../words.js";
-import { drawPlate, freePlace, stroke, textWidth, trace } from "./pen.js";
+import { drawPlate, freePlace, keepOff, stroke, textWidth, trace } from "./pen.js";
 
 const TRACK_S = 60, LABEL_CHARS = 40;
 const ARROW_PX = 14; // around a machine's arrow: a click there is for the machine, not for the ground
@@ -12,6 +12,11 @@ const areShown = () => choices.shows.machines && times.at === null;
 export function drawMachines(context) {
   if (!areShown()) return;
   for (const machine of site.machines.values()) drawMachine(context, machine);
+}
+
+// What is drawn before the machines keeps off their arrows.
+export function keepOffMachines() {
+  if (areShown()) for (const { x_m, y_m } of site.machines.values()) keepOff(view.toScreen(x_m, y_m), 2 * ARROW_PX);
 }
 
 // The machine that is drawn there; undefined for none.
@@ -77,13 +82,13 @@ function drawArrow(context, machine, [x, y], colour) {
   context.restore();
 }
 
-// A label is right of where the rail ends, and left of where the window does, if its machine is. It covers no other
-// label and no number of the panel's; a machine without room for one has none.
+// A label is right of where the rail ends, and left of where the window does, if its machine is. It covers no arrow, no
+// other label and no number of the panel's; a machine without room for one has none.
 function drawLabel(context, text, [left, middle], isGrey) {
   const { ink } = choices, edge = view.margins[0] - 16, width = textWidth(context, text) + 14;
   const isInside = left > edge && left < view.width;
   const x = isInside ? Math.max(edge + width / 2, Math.min(left, view.width - width / 2 - 4)) : left;
-  const place = freePlace([-20, 22, -42, 44, -64, 66].map((away) => [x, middle + away]), width);
+  const place = freePlace([-22, 22, -44, 44, -66, 66].map((away) => [x, middle + away]), width);
   const style = { face: ink.surface, colour: isGrey ? ink.soft : ink.text, alpha: 0.94 };
   if (place) drawPlate(context, text, place, width, style);
 }

@@ -51,7 +51,7 @@ export function drawPlace(context, place, name, pointed = false) {
   context.fill();
   if (!pointed && !name) stroke(context, ink.accent, 2.5);
   if (!name) return;
-  plates.push({ x, y, width: PLATE_PX });
+  keepOff([x, y], PLATE_PX);
   write(context, name, x, y, ink.surface);
 }
 
@@ -77,15 +77,17 @@ export function textWidth(context, text) {
 }
 
 export const clearPlates = () => { plates.length = 0; };
+export const keepOff = ([x, y], width) => plates.push({ x, y, width });
 
-// The first of places [x, y] where a plate of that width keeps off those of the picture; undefined where none does.
+// The first of places [x, y] where a plate of that width keeps off those of the picture, and off the cards at the top;
+// undefined where none does.
 export const freePlace = (places, width) =>
-  places.find(([x, y]) => plates.every((other) =>
+  places.find(([x, y]) => y > view.margins[1] - 6 && plates.every((other) =>
     Math.abs(y - other.y) > APART_PX || Math.abs(x - other.x) > (width + other.width) / 2 + 1));
 
 // Words on a plate.
 export function drawPlate(context, text, [x, y], width, { face, colour, halo = null, alpha = 1 }) {
-  plates.push({ x, y, width });
+  keepOff([x, y], width);
   context.beginPath();
   context.roundRect(x - width / 2, y - PLATE_PX / 2, width, PLATE_PX, 6);
   if (halo) stroke(context, halo, 2, 0.9);

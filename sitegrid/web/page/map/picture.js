@@ -8,7 +8,7 @@ import { drawBaseMap, drawOutline } from "./base_map.js";
 import { drawChanges } from "./changes.js";
 import { drawCross } from "./cross.js";
 import { drawGround } from "./ground.js";
-import { drawMachines } from "./machines.js";
+import { drawMachines, keepOffMachines } from "./machines.js";
 import { drawLanes } from "./lanes.js";
 import { clearPlates, ratio } from "./pen.js";
 import { drawTiles } from "./tiles.js";
@@ -17,7 +17,7 @@ export const canvas = byId("map");
 const drawPanel = (context) => panel.shown?.draw?.(context);
 // Layers, from the ground up: those of cells are drawn pixel by pixel, the others in the page's units.
 const LAYERS = [[drawGround, true], [drawBaseMap, true], [drawOutline], [drawTiles, true],
-  ...[drawLanes, drawChanges, drawPanel, drawMachines, drawCross].map((draw) => [draw])];
+  ...[drawLanes, drawChanges, keepOffMachines, drawPanel, drawMachines, drawCross].map((draw) => [draw])];
 
 let isDirty = true;
 export const drawn = { frames: 0 };

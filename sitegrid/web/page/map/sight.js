@@ -9,7 +9,7 @@ let fitted; // the box that the view was fitted to
 
 export const isPhone = () => innerWidth <= 720;
 function margins(besidePanel) {
-  if (isPhone()) return [16, 172, 16, besidePanel ? PANEL_PART * innerHeight + 32 : 130];
+  if (isPhone()) return [16, 172, 16, besidePanel ? PANEL_PART * innerHeight + 32 : 190];
   return [272, 66, besidePanel ? PANEL_PX : 24, 96];
 }
 

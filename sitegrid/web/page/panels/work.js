@@ -39,7 +39,7 @@ function head({ rows, total_kwh_ph: total, hours }) {
     return section(element("p", { className: "say empty" }, hours ? none : NO_ROADS), against);
   }
   const sum = (name) => rows.reduce((all, row) => all + row[name][0], 0), lost = sum("kwh_ph");
-  const since = hours < 1.5 ? `${Math.round(60 * hours)} minutes` : `${figure(hours)} hours`;
+  const since = hours < 1.5 ? count(Math.round(60 * hours), "minute") : `${figure(hours)} hours`;
   const short = `From ${since} of traffic. Losses per hour are shown after 30 minutes.`;
   if (isShort()) return section(note(short), against);
   return section(element("div", { className: "totals" },
@@ -50,6 +50,7 @@ function head({ rows, total_kwh_ph: total, hours }) {
   rows.some((row) => row.segment.guessed) ? element("p", { className: "note guess" }, GUESSED) : null, against);
 }
 
+const count = (number, word) => `${number} ${word}${number === 1 ? "" : word === "pass" ? "es" : "s"}`;
 const isShort = () => work.hours < LEAST_H;
 const isTarget = (target) => target > 0 && target <= 1;
 
@@ -75,10 +76,12 @@ function stretch(row, place) {
   const [kwh, low, high] = row.kwh_ph;
   const costs = `${figure(row.litres_ph[0])} L, ${Math.round(row.seconds_ph[0])} s`;
   const rolls = () => `${percent(resistance)} ${kindAt(resistance, site.boundaries).name}`;
-  const passes = passes_ph[0] + passes_ph[1], change = `${trend > 0 ? "+" : "−"}${percent(Math.abs(trend))}/day`;
-  const rate = `${passes.toFixed(passes < 9.95 ? 1 : 0)} passes/h`, count = Math.round(passes * work.hours);
-  const driven = `${Math.round(length_m)} m, ${isShort() ? `${count} passes` : rate}`;
-  return flier(`stretch-${id}`, "stretch", id, line, element("span", { className: "place" }, `${place}`),
+  const passes = passes_ph[0] + passes_ph[1], passed = count(Math.round(passes * work.hours), "pass");
+  const change = `${trend > 0 ? "+" : "−"}${percent(Math.abs(trend))}/day`;
+  const rate = `${passes.toFixed(passes < 9.95 ? 1 : 0)} passes/h`;
+  const driven = `${Math.round(length_m)} m, ${isShort() ? passed : rate}`;
+  const className = isShort() ? "stretch early" : "stretch";
+  return flier(`stretch-${id}`, className, id, line, element("span", { className: "place" }, `${place}`),
     element("span", {}, bold(resistance === null ? "not measured" : rolls()), small(driven), small(since(row))),
     element("span", { className: "days" }, sparkline(row), Math.abs(trend) < CLEAR_TREND ? null : small(change)),
     isShort() ? null : element("span", { className: "lost" }, bold(`${guessed ? "~" : ""}${figure(kwh)}`),
