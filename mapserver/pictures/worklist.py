@@ -14,6 +14,7 @@ from protocol.queries.roads import RoadChange, RoadSegment, Segments, Worklist
 from protocol.site.geometry import Bounds
 
 TOP = 10
+LEAST_HOURS = 0.5  # of traffic, for losses an hour, as on the live page: less does not say what an hour costs
 WIDE_PX, MARGIN_M = 1200, 25.0
 MOST_PX_PER_M = 8.0
 GROUND: Colour = (238, 240, 240)
@@ -55,25 +56,37 @@ def draw_worklist(roads: Segments, worklist: Worklist) -> Image:
     classes = [LegendEntry(WORST, f"costs most: the first {len(rows)}")] if rows else []
     classes += [LegendEntry(colour, words) for _, colour, words in STEPS] + [LegendEntry(UNKNOWN, "not known")]
     classes += [LegendEntry(REPAIRED, "repaired")] if repaired else []
-    title = f"Worth grading: {worklist.total_kwh_ph:.1f} kWh an hour lost against a resistance of {worklist.target:g}"
-    return compose(ground, axes, title, classes, notes=_notes(worklist))
+    return compose(ground, axes, _title(worklist), classes, notes=_notes(worklist))
+
+
+def _title(worklist: Worklist) -> str:
+    against = f"a resistance of {worklist.target:g}, from {60 * worklist.hours:.0f} min of traffic"
+    if worklist.hours < LEAST_HOURS:
+        return f"Worth grading against {against}; losses an hour are shown after {60 * LEAST_HOURS:.0f} min"
+    return f"Worth grading: {worklist.total_kwh_ph:.1f} kWh an hour lost against {against}"
 
 
 def _notes(worklist: Worklist) -> Sequence[str]:
-    notes = [""]
+    notes, is_short = [""], worklist.hours < LEAST_HOURS
     for place, row in enumerate(worklist.rows[:TOP], 1):
         value, low, high = row.kwh_ph
         one = row.segment
         known = f"{one.resistance:.3f} +- {one.resistance_std:.3f}" if one.resistance and one.resistance_std else "?"
-        notes.append(f"{place}  {value:.2f} kWh/h ({low:.2f} to {high:.2f}), {row.litres_ph[0]:.2g} l/h")
-        notes.append(f"     resistance {known}, {sum(one.passes_ph):.0f} passes/h" + " (mass guessed)" * one.guessed)
+        passes_ph = sum(one.passes_ph)
+        if is_short:
+            notes.append(f"{place}  resistance {known}, {passes_ph * worklist.hours:.0f} passes")
+        else:
+            notes.append(f"{place}  {value:.2f} kWh/h ({low:.2f} to {high:.2f}), {row.litres_ph[0]:.2g} l/h")
+            notes.append(
+                f"     resistance {known}, {passes_ph:.0f} passes/h" + " (mass guessed)" * one.guessed
+            )
         if row.before is not None:
             notes.append(f"     since {_time(row.since_ns)}, {row.before:.3f} before")
     ranks = [row.rank for row in worklist.rows[:TOP]]
     if len(set(ranks)) < len(ranks):
         notes.append("Those that cost nearly the same may stand in either order.")
     for changes, words, effect in zip(_changes(worklist), ("repaired", "worse"), ("saved", "more lost"), strict=True):
-        if changes:
+        if changes and not is_short:
             kwh_ph = abs(sum(change.saved_kwh_ph for change in changes))
             notes.append(f"{len(changes)} {words} since they were known: {kwh_ph:.1f} kWh an hour {effect}")
     return notes

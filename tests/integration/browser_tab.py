@@ -16,6 +16,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 NO_BROWSER = "no Chromium: install it, for example with `apt-get install chromium`"
 needs_browser = [pytest.mark.processes, pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)]
 WAIT_MS = 1000 * PATIENCE_S
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 NOBODY = "http://nobody.invalid/**"
 
 

@@ -17,7 +17,7 @@ from protocol.queries.requests import WhyQuery
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch, encode_health, encode_pose
 from protocol.wire.messages import Health, Pose, SampleBatch
-from tests.integration.browser_tab import WAIT_MS, Tab, axe_script, needs_browser, watched
+from tests.integration.browser_tab import PHONE, WAIT_MS, Tab, axe_script, needs_browser, watched
 from tests.integration.forks import Forks
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME, START_NS, WebSite
@@ -25,7 +25,6 @@ from tests.patience import PATIENCE_S, until
 from tests.soak import BATCH_S
 
 pytestmark = needs_browser
-PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 
 
 @pytest.fixture

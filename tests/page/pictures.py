@@ -16,14 +16,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tests.integration.browser_tab import Tab, launched
+from tests.integration.browser_tab import PHONE, Tab, launched
 from tests.integration.forks import Forks
 from tests.integration.hauling_site import hauling_site
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME
 from tests.patience import until
 
-PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 DRIVEN_NS = 330e9  # the demo is photographed so late, while its machines still drive
 OUTLINE = [[-10, -8], [172, -8], [172, 142], [-2, 142], [-10, 100], [-10, -8]]  # around the haulers' roads [m]
 

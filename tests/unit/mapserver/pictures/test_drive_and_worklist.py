@@ -59,3 +59,12 @@ def test_what_became_worse_is_not_green():
     change = WORK.changes[0]
     worse = replace(change, before=change.after, after=change.before, saved_kwh_ph=-change.saved_kwh_ph)
     assert count(draw_worklist(ROADS, replace(WORK, rows=(), changes=(worse,))), REPAIRED) == 0
+
+
+def test_losses_an_hour_need_half_an_hour_of_traffic() -> None:
+    early, late = (replace(WORK, hours=hours) for hours in (0.2, 2.0))
+    title, *notes = (worklist._title(early), *worklist._notes(early))
+    assert "from 12 min of traffic" in title
+    assert not any("kWh" in words for words in (title, *notes))
+    assert "kWh an hour lost" in worklist._title(late)
+    assert any("kWh/h" in words for words in worklist._notes(late))
