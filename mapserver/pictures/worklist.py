@@ -77,9 +77,7 @@ def _notes(worklist: Worklist) -> Sequence[str]:
             notes.append(f"{place}  resistance {known}, {passes_ph * worklist.hours:.0f} passes")
         else:
             notes.append(f"{place}  {value:.2f} kWh/h ({low:.2f} to {high:.2f}), {row.litres_ph[0]:.2g} l/h")
-            notes.append(
-                f"     resistance {known}, {passes_ph:.0f} passes/h" + " (mass guessed)" * one.guessed
-            )
+            notes.append(f"     resistance {known}, {passes_ph:.0f} passes/h" + " (mass guessed)" * one.guessed)
         if row.before is not None:
             notes.append(f"     since {_time(row.since_ns)}, {row.before:.3f} before")
     ranks = [row.rank for row in worklist.rows[:TOP]]
