@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +13,7 @@ import pytest
 from protocol.queries.roads import WorklistQuery, WorklistRow
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES
-from tests.integration.browser_tab import Tab, needs_browser, watched
+from tests.integration.browser_tab import PHONE, Tab, needs_browser, watched
 from tests.integration.hauling_site import DAY_NS, FIRST_NS
 from tests.integration.web_site import WebSite
 
@@ -95,6 +97,26 @@ def test_a_click_on_a_row_flies_to_its_stretch_beside_the_panel(tab: Tab, web: W
         left, top = tab.pixel_of(*point)
         assert 250 < left < 1280 - 380
         assert 60 < top < 720
+
+
+def test_labels_and_numbers_keep_off_each_other_on_phones(browser, web: WebSite):
+    places = [row.segment.line[len(row.segment.line) // 2] for row in listed(web)[::3]]
+    for width, height in ((390, 844), (320, 640)):
+        size = {**PHONE, "viewport": {"width": width, "height": height}}
+        tab = Tab(browser, f"{web.url}?panel=work", **size).loaded()
+        tab.until(f"sitegrid.work.rows.length === 10 && {QUIET}")
+        for i, (x_m, y_m) in enumerate(places):
+            pose = {"machine": f"loader-{i}", "x_m": x_m, "y_m": y_m, "heading_rad": 0, "age_s": 0}
+            machine = json.dumps({**pose, "cov_xx_m2": 1, "cov_xy_m2": 0, "cov_yy_m2": 1, "track": []})
+            tab.js(f"sitegrid.site.machines.set('loader-{i}', {{...{machine}, seen_s: performance.now() / 1000}})")
+        tab.js("sitegrid.site.tell('poses')")
+        tab.drawn()
+        plates = tab.js("sitegrid.plates")
+        assert len(plates) > len(places), "arrows, numbers and labels"
+        for one, other in itertools.combinations(plates, 2):
+            across, down = abs(one["x"] - other["x"]), abs(one["y"] - other["y"])
+            assert down >= 20 or across >= (one["width"] + other["width"]) / 2, (width, one, other)
+        tab.close()
 
 
 @pytest.mark.nightly

@@ -11,6 +11,7 @@ import { onKey } from "./keys.js";
 import { keepLink, restoreLink } from "./link.js";
 import { showBackdrop } from "./map/base_map.js";
 import { canvas, drawFrame, drawFrames, drawn, redraw } from "./map/picture.js";
+import { plates } from "./map/pen.js";
 import { followPointers } from "./map/pointer.js";
 import { fitUnlessMoved, keepInSight } from "./map/sight.js";
 import { PANELS } from "./panels/index.js";
@@ -19,7 +20,7 @@ import { work } from "./panels/work.js";
 import { choices, shown, site, times, view } from "./state/index.js";
 
 const QUIET_MS = 400; // a page that loads faster than this says nothing about it
-window.sitegrid = { site, choices, times, view, panel, shown, drawn, route, work }; // for tests, and for a console
+window.sitegrid = { site, choices, times, view, panel, shown, drawn, plates, route, work }; // for tests, and for a console
 
 site.on("sites", showSites);
 site.on("state", showNotice, showStatus);

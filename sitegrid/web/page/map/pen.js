@@ -3,7 +3,7 @@ import { choices, view } from "../state/index.js";
 
 const PLATE_PX = 20, APART_PX = 21; // height of a plate; of the middles of two that stand above each other
 
-const plates = []; // of this picture: {x, y, width}
+export const plates = []; // of this picture, and arrows: {x, y, width}
 
 export const ratio = () => Math.min(2, devicePixelRatio || 1); // pixels of a canvas in one of the page's
 
