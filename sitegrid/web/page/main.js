@@ -20,7 +20,7 @@ import { work } from "./panels/work.js";
 import { choices, shown, site, times, view } from "./state/index.js";
 
 const QUIET_MS = 400; // a page that loads faster than this says nothing about it
-window.sitegrid = { site, choices, times, view, panel, shown, drawn, plates, route, work }; // for tests, and for a console
+window.sitegrid = { site, choices, times, view, panel, shown, drawn, plates, route, work }; // for tests
 
 site.on("sites", showSites);
 site.on("state", showNotice, showStatus);
