@@ -28,7 +28,7 @@ from protocol.queries.answers import MapInfo, MapVersion
 from protocol.queries.requests import RegionQuery
 from protocol.site.geometry import Bounds
 from sitegrid.web import live, values
-from sitegrid.web.backdrop import Backdrop, BackdropConfig
+from sitegrid.web.backdrop import Backdrop
 from sitegrid.web.encoding import Cache, as_json, beside
 from sitegrid.web.guard import Guard
 from sitegrid.web.openapi import PREFIX, description
@@ -58,7 +58,7 @@ class WebApp:
         backdrops: Mapping[str, Backdrop],
     ) -> None:
         self._feeds = {feed.name: feed for feed in feeds}
-        self._backdrops = {name: backdrops.get(name, Backdrop(BackdropConfig())) for name in self._feeds}
+        self._backdrops = {name: backdrops.get(name, Backdrop()) for name in self._feeds}
         self._pngs: Cache[bytes] = Cache(PNG_BYTES, len)
         site = f"{PREFIX}/sites/{{site}}"
         routes = [
@@ -139,11 +139,10 @@ class WebApp:
 
     async def _base_map(self, request: Request) -> Response:
         """The base map's picture."""
-        try:
-            picture = self._backdrops[self._feed(request).name].picture
-        except RequestProblem as error:
-            return problem_response(error)
-        return FileResponse(picture) if picture else _not_there(request, HTTPException(HTTPStatus.NOT_FOUND))
+        backdrop = self._backdrops.get(request.path_params["site"], Backdrop())
+        if backdrop.has_tiles or not backdrop.base_map:
+            return _not_there(request, HTTPException(HTTPStatus.NOT_FOUND))
+        return FileResponse(backdrop.base_map)
 
     async def _tilejson(self, request: Request) -> Response:
         """TileJSON of a layer, as colours or values."""

@@ -1,17 +1,13 @@
-"""`python -m tests.page.pictures FOLDER`: the pictures of the live page in docs/web.md.
+"""`python -m tests.page.pictures URL FOLDER`: the pictures of the live page in docs/web.md.
 
-It runs `sitegrid demo` for machines that drive, and the tests' site of four days of haulers for roads. Needs Chromium,
-Playwright, and ten minutes.
+URL: the page of a demo that has driven for five minutes and still drives (`sitegrid demo --web --seconds 1800`). Roads
+are those of the tests' site after four days of haulers. Needs Chromium and Playwright.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,40 +17,25 @@ from tests.integration.forks import Forks
 from tests.integration.hauling_site import hauling_site
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME
-from tests.patience import until
 
-DRIVEN_NS = 330e9  # the demo is photographed so late, while its machines still drive
-OUTLINE = [[-10, -8], [172, -8], [172, 142], [-2, 142], [-10, 100], [-10, -8]]  # around the haulers' roads [m]
+OUTLINE = [[4, 3], [166, 3], [166, 120], [148, 137], [4, 137], [4, 3]]  # around the haulers' roads [m]
 
 
 def main() -> None:
     """Write all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("url")
     parser.add_argument("out", type=Path)
-    out = parser.parse_args().out
+    arguments = parser.parse_args()
     for browser in launched():
-        with TemporaryDirectory() as folder, demo(Path(folder)) as url:
-            of_machines(browser, url, out)
+        of_machines(browser, arguments.url, arguments.out)
         with TemporaryDirectory() as folder:
-            of_roads(browser, Path(folder), out)
-
-
-@contextlib.contextmanager
-def demo(folder: Path) -> Iterator[str]:
-    """The address of a demo's page; the demo ends with the block."""
-    words = ("demo", "--web", "--headless", "--seconds", "1800", "--out", str(folder))
-    with subprocess.Popen([sys.executable, "-m", "sitegrid.cli", *words], stderr=subprocess.PIPE, text=True) as child:
-        assert child.stderr
-        yield next(line.split()[-1] for line in child.stderr if line.startswith("the map is at"))
-        child.terminate()
-        child.stderr.read()  # else it waits for a reader
+            of_roads(browser, Path(folder), arguments.out)
 
 
 def of_machines(browser: Any, url: str, out: Path) -> None:
     """Pictures of machines that drive."""
     tab = Tab(browser, url).loaded()
-    until(lambda: tab.js("sitegrid.site.stamp_ns - sitegrid.site.first_ns") > DRIVEN_NS, "a map")
-    tab.js("sitegrid.times.span()")
     shoot(tab, out, "light")
     tab.js("sitegrid.choices.toggleTheme()")
     shoot(tab, out, "dark")
@@ -77,14 +58,14 @@ def of_machines(browser: Any, url: str, out: Path) -> None:
 
 
 def commonest_place(tab: Tab) -> list[float]:
-    """A cell that many passed."""
+    """A cell in the west, clear of the panel, that many passed."""
     return list(
         tab.js(
             """(() => {
-              const { map } = sitegrid.site, cells = [];
+              const { map } = sitegrid.site, cells = [], west = map.bounds()[0];
               for (const tile of map.tiles.values()) map.plane(tile, "visits").forEach((visits, i) =>
                 cells.push([visits, 64 * tile.x + i % 64 + 0.5, 64 * tile.y + Math.floor(i / 64) + 0.5]));
-              return cells.reduce((a, b) => (b[0] > a[0] ? b : a)).slice(1);
+              return cells.reduce((a, b) => (b[0] > a[0] && b[1] < west + 100 ? b : a)).slice(1);
             })()"""
         )
     )

@@ -26,7 +26,7 @@ site.on("sites", showSites);
 site.on("state", showNotice, showStatus);
 site.on("map", () => choices.suit(site.map), showNotice, restoreLink, keepInSight, showLegend, redraw);
 site.on("poses", showNoticeOfEmpty, keepInSight, showStatus, redraw);
-site.on("backdrop", showBackdrop, fitUnlessMoved);
+site.on("backdrop", showBackdrop, showRail, fitUnlessMoved);
 site.on("facts", () => times.span(), redraw);
 choices.on("layer", showRail, showLegend, keepLink, redraw);
 choices.on("shows", showRail, redraw);

@@ -1,7 +1,7 @@
 // Card: what the map can show, and what is shown.
 import { byId, element } from "../elements.js";
 import { LAYERS } from "../layers.js";
-import { choices } from "../state/index.js";
+import { choices, site } from "../state/index.js";
 
 export const SHOWS = [["machines", "Machines", "M"], ["tracks", "Tracks, last minute", "T"],
   ["changes", "Changed ground", "G"], ["lanes", "Lanes", "N"], ["base", "Base map", "P"],
@@ -26,4 +26,5 @@ export function showRail() {
   document.getElementsByName("layer")[LAYERS.indexOf(choices.layer)].checked = true;
   byId("drawer").textContent = choices.layer.name;
   for (const [name] of SHOWS) document.getElementsByName(name)[0].checked = choices.shows[name];
+  document.getElementsByName("base")[0].parentElement.hidden = !site.backdrop?.base_map;
 }

@@ -1,24 +1,17 @@
-// Card: buttons for panels, the view, a picture beneath, the link, light or dark, and keys.
+// Card: buttons for panels, the view, the link, light or dark, and keys.
 import { byId } from "../elements.js";
 import { showHelp } from "../keys.js";
 import { copyLink } from "../link.js";
-import { readPicture } from "../map/base_map.js";
 import { fit } from "../map/sight.js";
 import { choices } from "../state/index.js";
-import { say } from "./notice.js";
 import { panel } from "./panel.js";
 
 const PANELS = ["agents", "work", "route"], DONE_MS = 900;
-const file = byId("plan-file");
 
 export function buildTools() {
   for (const name of PANELS) byId(`open-${name}`).onclick = () => panel.toggle(name);
-  const does = { fit, theme: () => choices.toggleTheme(), keys: showHelp, link, plan: () => file.click() };
+  const does = { fit, theme: () => choices.toggleTheme(), keys: showHelp, link };
   for (const [name, act] of Object.entries(does)) byId(name).onclick = act;
-  file.onchange = async () => {
-    await readPicture([...file.files]).catch((error) => say("This picture cannot be shown", error.message));
-    file.value = "";
-  };
 }
 
 async function link() {

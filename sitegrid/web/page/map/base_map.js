@@ -1,98 +1,59 @@
-// Layers beneath the map: a base map, which the page's server names or a file of this tab is, and the site's outline.
+// Layers beneath the map, where the page's server has them: a base map (a picture, or tiles), and the site's outline.
 import { say } from "../cards/notice.js";
 import { byId } from "../elements.js";
 import { around, choices, site, view } from "../state/index.js";
-import { drawPicture, ratio, stroke, trace } from "./pen.js";
+import { ratio, stroke, trace } from "./pen.js";
 import { redraw } from "./picture.js";
 
-const TILE_PX = 256, KEPT = 1000; // a tile's side; tiles that are kept
+const TILE_PX = 256;
 const COARSER = 2; // zooms that are drawn beneath, until the tiles of the right one have come
 const ROUNDS = 5; // from the site to Web Mercator, each a hundred times closer
 const MOST_TILES = 1000; // of one zoom: more are of a place where the fit means nothing
-const tiles = new Map(); // images by address
-let picture = null; // {image, corners}: north-west, north-east, south-west [m]
+const images = new Map(); // by address
 let waiting = 0, loaded = 0, isSaid = false;
 
-// Take what the page's server says.
 export function showBackdrop() {
-  const { base_map: base, attribution, problem } = site.backdrop;
-  if (problem) return say("The site's outline and base map cannot be shown", problem);
+  const { attribution = "", problem } = site.backdrop;
   byId("attribution").textContent = attribution;
-  if (base?.picture) picture = { image: load(base.picture), corners: base.corners };
-  redraw();
+  if (problem) say("The site's outline and base map cannot be shown.", problem);
 }
 
-// Lay a picture of this tab beneath, by its world file: pixel (column, row) is at a*column + b*row + c, d*column + ...
-export async function readPicture(files) {
-  const file = files.find(({ type }) => type.startsWith("image/"));
-  const world = files.find(({ name }) => /\.(pgw|jgw|wld)$/i.test(name));
-  if (!file || !world) throw new Error("Choose the picture and its world file (.pgw, .jgw or .wld) together.");
-  const lines = (await world.text()).trim().split(/\s+/).map(Number), [a, d, b, e, c, f] = lines;
-  if (lines.length !== 6 || !lines.every(Number.isFinite) || a * e === d * b) {
-    throw new Error(`${world.name} is no world file: six numbers, in metres of the site.`);
+export function drawOutline(context) {
+  for (const ring of site.backdrop?.outline ?? []) {
+    trace(context, [...ring, ring[0]].map((place) => view.toScreen(...place)));
+    stroke(context, choices.ink.halo, 4, 0.7);
+    stroke(context, choices.ink.soft, 1.5);
   }
-  const image = await createImageBitmap(file), { width, height } = image;
-  const at = (column, row) => [a * (column - 0.5) + b * (row - 0.5) + c, d * (column - 0.5) + e * (row - 0.5) + f];
-  picture = { image, corners: [at(0, 0), at(width, 0), at(0, height)] };
-  choices.setShow("base", true);
-}
-
-function load(address) {
-  const image = new Image();
-  waiting++;
-  image.onload = () => { loaded++; settle(); };
-  image.onerror = settle;
-  image.src = address;
-  return image;
-}
-
-// Tiles beyond what a server has may be missing; where nothing comes at all, the page says so once.
-function settle() {
-  waiting--;
-  redraw();
-  if (waiting || loaded || isSaid) return;
-  isSaid = true;
-  say("The base map cannot be loaded.", "The map goes on without it.");
 }
 
 export function drawBaseMap(context) {
   const base = site.backdrop?.base_map;
-  if (!choices.shows.base) return;
+  if (!base || !choices.shows.base) return;
   context.globalAlpha = Number(choices.ink.beneath);
-  if (picture?.image.width) drawPicture(context, picture.image, picture.corners.map(pixels));
-  else if (base?.tiles) drawTiles(context, base);
+  if (base.picture) drawImage(context, base.picture, base.corners);
+  else {
+    const zoom = Math.round(Math.log2((base.metres * view.scale * ratio()) / TILE_PX));
+    const finest = Math.min(base.max_zoom, Math.max(0, zoom));
+    for (let z = Math.max(0, finest - COARSER); z <= finest; z++) drawTiles(context, base, z);
+  }
   context.globalAlpha = 1;
 }
 
-const pixels = (place) => view.toScreen(...place).map((v) => Math.round(v * ratio())); // whole: tiles leave no seams
-
-function drawTiles(context, base) {
-  const zoom = Math.round(Math.log2((base.metres * view.scale * ratio()) / TILE_PX));
-  const finest = Math.min(base.max_zoom, Math.max(0, zoom));
-  for (let z = Math.max(0, finest - COARSER); z <= finest; z++) drawZoom(context, base, z, z === finest);
-}
-
-function drawZoom(context, base, z, isWanted) {
+function drawTiles(context, base, z) {
   const { origin: [west, north], metres } = base, count = 2 ** z;
   const tileOf = (place) => {
     const [p, q] = worldOf(base, view.toSite(...place));
     return [(west + p / metres) * count, (north - q / metres) * count].map(Math.floor);
   };
-  const places = [[0, 0], [view.width, 0], [0, view.height], [view.width, view.height]].map(tileOf);
-  const [left, top, right, bottom] = around(places.map(([x, y]) => [x, y, x, y]));
+  const tiles = [[0, 0], [view.width, 0], [0, view.height], [view.width, view.height]].map(tileOf);
+  const [left, top, right, bottom] = around(tiles.map(([x, y]) => [x, y, x, y]));
   if (!((right - left + 1) * (bottom - top + 1) <= MOST_TILES)) return;
-  const corner = (x, y) => pixels(siteOf(base, metres * (x / count - west), metres * (north - y / count)));
+  const corner = (x, y) => siteOf(base, metres * (x / count - west), metres * (north - y / count));
   for (let y = top; y <= bottom; y++) for (let x = left; x <= right; x++) {
-    const image = tile(base.tiles, z, ((x % count) + count) % count, y, isWanted);
-    if (image?.width) drawPicture(context, image, [corner(x, y), corner(x + 1, y), corner(x, y + 1)]);
+    const named = { "{z}": z, "{x}": ((x % count) + count) % count, "{y}": y };
+    const address = base.tiles.replace(/\{[zxy]\}/g, (name) => named[name]);
+    drawImage(context, address, [corner(x, y), corner(x + 1, y), corner(x, y + 1)]);
   }
-}
-
-function tile(template, z, x, y, isWanted) {
-  const address = template.replace("{z}", z).replace("{x}", x).replace("{y}", y);
-  if (isWanted && !tiles.has(address)) tiles.set(address, load(address));
-  if (tiles.size > KEPT) tiles.delete(tiles.keys().next().value);
-  return tiles.get(address);
 }
 
 // From metres east and north of the site's origin in Web Mercator to metres of the site, and back.
@@ -109,10 +70,32 @@ function worldOf(base, [x, y]) {
   return [p, q];
 }
 
-export function drawOutline(context) {
-  for (const ring of site.backdrop?.outline ?? []) {
-    trace(context, [...ring, ring[0]].map((place) => view.toScreen(...place)));
-    stroke(context, choices.ink.halo, 4, 0.7);
-    stroke(context, choices.ink.soft, 1.5);
-  }
+// An image by its corners on the site: north-west, north-east, south-west. Whole pixels: tiles leave no seams.
+function drawImage(context, address, corners) {
+  const image = imageOf(address), { width, height } = image;
+  if (!width) return;
+  const [[x, y], [east, eastY], [south, southY]] =
+    corners.map((place) => view.toScreen(...place).map((v) => Math.round(v * ratio())));
+  context.save();
+  context.transform((east - x) / width, (eastY - y) / width, (south - x) / height, (southY - y) / height, x, y);
+  context.drawImage(image, 0, 0);
+  context.restore();
+}
+
+function imageOf(address) {
+  if (images.has(address)) return images.get(address);
+  const image = Object.assign(new Image(), { onload: () => settle(1), onerror: () => settle(0), src: address });
+  images.set(address, image);
+  waiting++;
+  return image;
+}
+
+// A tile may be missing where its server has none; where nothing comes at all, the page says so once.
+function settle(count) {
+  waiting--;
+  loaded += count;
+  redraw();
+  if (waiting || loaded || isSaid) return;
+  isSaid = true;
+  say("The base map cannot be loaded.", "The map goes on without it.");
 }

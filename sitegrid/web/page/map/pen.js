@@ -55,15 +55,6 @@ export function drawPlace(context, place, name, pointed = false) {
   write(context, name, x, y, ink.surface);
 }
 
-// A picture by its corners on the canvas: north-west, north-east, south-west.
-export function drawPicture(context, image, [[x, y], [east, eastY], [south, southY]]) {
-  const { width, height } = image;
-  context.save();
-  context.transform((east - x) / width, (eastY - y) / width, (south - x) / height, (southY - y) / height, x, y);
-  context.drawImage(image, 0, 0);
-  context.restore();
-}
-
 function write(context, text, x, y, colour) {
   font(context, "600 12px");
   context.fillStyle = colour;

@@ -55,9 +55,7 @@ class Site extends Owner {
   async #askBackdrop() {
     try {
       this.become("backdrop", { backdrop: await getJson(this.path("backdrop")) });
-    } catch (error) { // while the map server is away, it is asked again once it is back
-      if (error.status < 500) this.become("backdrop", { backdrop: { outline: [], problem: error.message } });
-    }
+    } catch (error) { this.become("backdrop", { backdrop: { outline: [], problem: error.message } }); }
   }
 
   #takeFrame(frame) {

@@ -9,7 +9,7 @@ import pytest
 
 from protocol.errors import ConfigError
 from protocol.site.site_config import Projection, SiteConfig
-from sitegrid.web.backdrop import Backdrop, BackdropConfig, load_backdrops
+from sitegrid.web.backdrop import Backdrop, load_backdrops
 from sitegrid.web.values import RequestProblem
 from sitegrid.web.xyz.mercator import tiles_at
 
@@ -54,7 +54,7 @@ def test_metres_stay_as_they_are(tmp_path: Path) -> None:
 def test_tiles_lie_where_their_places_are(latitude: float) -> None:
     site = SiteConfig("pit", latitude, 179.99)
     projection = Projection(site)
-    base_map = Backdrop(BackdropConfig(base_map=TILES)).described(site, projection, "")["base_map"]
+    base_map = Backdrop(base_map=TILES).described(site, projection, "")["base_map"]
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-20e3, 20e3, 5)] * 2))
     lat, lon, _ = projection.to_geodetic_many(x, y, np.zeros_like(x))
     u, v = tiles_at(lat, np.where(lon < 0, lon + 360, lon), 0)
@@ -70,18 +70,18 @@ def test_tiles_lie_where_their_places_are(latitude: float) -> None:
     [
         (TILES, "https://tiles.example/ortho/"),
         ("http://10.0.0.5:8000/a{z}/{x}/{y}", "http://10.0.0.5:8000/"),
-        ("https://tiles.example/wmts?z={z}&x={x}&y={y}", "https://tiles.example/wmts"),
+        ("https://tiles.example/wmts?z={z}&x={x}&y={y}", "https://tiles.example/"),
     ],
 )
 def test_pages_may_load_pictures_from_the_tiles_folder_alone(address: str, source: str) -> None:
-    assert Backdrop(BackdropConfig(base_map=address)).source == source
+    assert Backdrop(base_map=address).source == source
 
 
 @pytest.mark.parametrize(
     ("toml", "problem"),
     [
         ('outline = "none.geojson"', "none.geojson: cannot be read"),
-        ('base_map = "none.png"\nbounds = [0, 0, 1, 1]', "none.png is no file"),
+        ('base_map = "none.png"\nbounds = [0, 0, 1, 1]', "neither an address nor a file .png"),
         ('base_map = "site.tif"', "neither an address nor a file .png"),
         ('base_map = "site.png"', "a picture needs [west, south, east, north]"),
         ('base_map = "site.png"\nbounds = [8, 49, 7, 50]', "a picture needs [west, south, east, north]"),
@@ -109,23 +109,21 @@ def test_what_cannot_be_is_refused_in_a_line(tmp_path: Path, toml: str, problem:
         ({"type": "Polygon"}, "is no GeoJSON"),
         ({"type": "Point", "coordinates": [8, 49]}, "holds no polygon"),
         ({"type": "Polygon", "coordinates": [SQUARE[:2]]}, "fewer than three corners"),
-        ({"type": "Polygon", "coordinates": [[[0, 0], [900, 0], [900, 400]]]}, "see `units`"),
-        ({"type": "Polygon", "coordinates": [[[0, 0]] * 10_001]}, "simplify it"),
     ],
 )
 def test_an_outline_that_is_none_is_refused_in_a_line(tmp_path: Path, shape: Any, problem: str) -> None:
-    with pytest.raises(ConfigError, match=r"site\.geojson: ") as refused:
+    with pytest.raises(ConfigError, match=r"site\.geojson") as refused:
         loaded(tmp_path, 'outline = "site.geojson"', shape)
     assert problem in str(refused.value)
 
 
 def test_an_outline_of_elsewhere_is_named(tmp_path: Path) -> None:
-    swapped = {"type": "Polygon", "coordinates": [[[lat, lon] for lon, lat in SQUARE]]}
-    backdrop = loaded(tmp_path, 'outline = "site.geojson"', swapped)
+    in_metres = [[0, 0], [900, 0], [900, 400]]
+    backdrop = loaded(tmp_path, 'outline = "site.geojson"', {"type": "Polygon", "coordinates": [in_metres]})
     with pytest.raises(RequestProblem, match="100 km off the site"):
         backdrop.described(SITE, Projection(SITE), "")
 
 
 def test_the_sample_has_every_option_with_its_default() -> None:
     backdrop = load_backdrops(Path("config/web.toml"))["paper"]
-    assert backdrop == Backdrop(BackdropConfig())
+    assert backdrop == Backdrop()
