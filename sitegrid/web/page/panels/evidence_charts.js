@@ -6,7 +6,7 @@ import { choices, site } from "../state/index.js";
 import { clock, percent, short } from "../words.js";
 import { chart, write } from "./chart.js";
 
-const VOTES_PX = 104, ROSE_PX = 84, COURSE_PX = 74, LEFT_PX = 34;
+const VOTES_PX = 104, ROSE_PX = 84, COURSE_PX = 74, LEFT_PX = 34, LINE_PX = 12;
 
 // A colour of rolling resistance, whatever layer is shown.
 export const colourOf = (value) =>
@@ -76,7 +76,7 @@ export function courseChart(spans, changed_ns) {
     const x = (ns) => LEFT_PX + (width - LEFT_PX - 2) * (ns - from) / Math.max(1, to - from);
     const y = (v) => 6 + (COURSE_PX - 24) * (1 - (v - low) / (high - low));
     context.fillStyle = ink.soft;
-    for (const value of [least, most]) {
+    for (const value of y(least) - y(most) < LINE_PX ? [most] : [least, most]) {
       trace(context, [[LEFT_PX, y(value)], [width, y(value)]]);
       stroke(context, ink.hatch, 1);
       write(context, percent(value), 0, y(value) + 4, "left");
