@@ -50,6 +50,7 @@ LOADS = {
     "fleet": "a fleet at a real server: acknowledgements, and what they cost; the link of an agent",
     "live": "processor time of a server at work, by thread",
     "query": "queries of a real server while samples come in",
+    "visitors": "memory that a visitor's worst questions cost the map server and the web server (minutes)",
     "restart": "a store opened, a journal folded again, and memory",
     "filter": "steps of the filters, the smoother, a whole agent",
     "sim": "simulated time of small and large fleets, sensors on",

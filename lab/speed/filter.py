@@ -1,7 +1,7 @@
 """Microseconds per filter step, ours and stock filterpy; cost of the smoother and a whole agent.
 
 Stock runs twice: plain, wrong where angles wrap at +-pi, and with its optional angle functions. The agent's pure core
-runs in a process of its own that imports an agent only: `python -m lab.speed.agent SECONDS`.
+runs in a process of its own that imports an agent only: `python -m lab.agent SECONDS`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from agents.localisation.filters.state import ATTITUDE, POSITION, RATE, VELOCITY
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.localiser import LocalisationConfig
 from agents.positioning import PipelineConfig, Positioning
-from lab.speed import agent
+from lab import agent
 from lab.speed.measure import Figures, in_child, in_turn, rows_of, timed
 from protocol.arrays import Floats
 from protocol.machine.readings import Reading
@@ -61,7 +61,7 @@ def run(steps: int, runs: int) -> Iterator[Row]:
     for name in ("ekf", "ukf"):
         without, with_it = (100 * cost[f"{name}, {lag_s:g}"]["cpu_s"] / SMOOTHER_S for lag_s in LAGS_S)
         yield from rows_of(f"{name} and smoother", {"cpu_percent": with_it, "smoother_percent": with_it - without})
-    whole = in_turn({"agent": partial(in_child, "lab.speed.agent", str(AGENT_S))}, runs)
+    whole = in_turn({"agent": partial(in_child, "lab.agent", str(AGENT_S))}, runs)
     yield from rows_of("agent", whole["agent"])
 
 

@@ -58,6 +58,15 @@ class Site(Children):
         """A follower, for the block; yields its process id."""
         return self._running("follow", "--name", name, *self._files)
 
+    @contextmanager
+    def showing(self) -> Iterator[tuple[int, str]]:
+        """A web server, for the block; yields its process id and address."""
+        process = self.start("web", "web", "--endpoint", self.endpoint, "--site", SITE.name, "--listen", "127.0.0.1:0")
+        try:
+            yield process.pid, process.expect("ready", READY_S)["url"]
+        finally:
+            process.stop()
+
     @property
     def _files(self) -> tuple[str | Path, ...]:
         files = ("--site-file", self._folder / "site.toml", "--config", self._folder / "server.toml")

@@ -18,7 +18,7 @@ from typing import Any, cast
 
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
-from lab.speed import agent
+from lab import agent
 from lab.speed.measure import Figures, rows_of
 from lab.speed.site import SITE
 from mapserver.config import ServerConfig

@@ -108,6 +108,12 @@ class Grid:
         inside = ((x, y) for x in range(first_x, last_x + 1) for y in range(first_y, last_y + 1))
         return [block for block in inside if block in self._timelines]
 
+    def size(self, blocks: Iterable[Block]) -> int:
+        """Bytes of the evidence in blocks."""
+        self._drain()
+        lines = (self._timelines.get(block) for block in blocks)
+        return sum(len(record) for line in lines if line for record in line.records)
+
     def pages(self, blocks: Iterable[Block]) -> list[TimedPages]:
         """Pages of each block by time; empty without evidence."""
         self._drain()

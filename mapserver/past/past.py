@@ -120,15 +120,16 @@ class StorePast:
         to_ns: int,
         window: CellWindow | None = None,
         facts: Facts = NO_FACTS,
+        until: int = LAST,
     ) -> Grid:
-        """The fold of samples stamped up to `to_ns`, with these facts.
+        """The fold of samples stamped up to `to_ns`, with these facts, of rows up to `until` and a checkpoint's.
 
         window: only its cells are complete, and only nearby data is read.
         """
         grid, base = self.nearest(reader, to_ns, window, facts)
         bounds = reach_of(window, self.cell_m, self.config) if window else None
         with lent(1 if window else THREADS) as workers, grid.bulk(workers):
-            for samples, names in self.lacking(reader, base, Selection.by(facts, to_ns=to_ns, bounds=bounds)):
+            for samples, names in self.lacking(reader, base, Selection.by(facts, to_ns=to_ns, bounds=bounds), until):
                 grid.fold_all(samples, names)
         return grid
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Set
+from collections.abc import Callable, Iterator, Set
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from mapserver.change.detection import reach_blocks
 from mapserver.evidence.timeline import Block
+from mapserver.journal.facts import Facts
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
@@ -21,12 +22,23 @@ from mapserver.query.cell_reasons import reasons
 from mapserver.query.coverage import coverage
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.on_site import check_on_site
-from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, RegionReading
+from mapserver.query.region_pieces import PIECE_BYTES, LookAt, OpenRegions, PieceGrid, RegionReading
 from mapserver.query.road_maps import RoadMaps
 from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource, MapState
-from mapserver.query.views import PastMaps, StillMap, View, check_past, read_lanes, view_now, widened
-from protocol.arrays import Floats, Floats32, Ints
+from mapserver.query.views import (
+    PastMaps,
+    StillMap,
+    View,
+    bounds_of,
+    check_blocks,
+    check_past,
+    parts_of,
+    read_lanes,
+    view_now,
+    widened,
+)
+from protocol.arrays import Bools, Floats, Floats32, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.answers import (
@@ -120,6 +132,10 @@ class Answers:
     def _past(self) -> PastMaps:
         return PastMaps(self._source.location, self._source.past, self._config)
 
+    def reads_past(self, query: MapQuery[Any]) -> bool:
+        """Whether a query reads the journal, also for a piece of an open region."""
+        return query.reads_past or (isinstance(query, PieceQuery) and self._open.is_past(query.cursor))
+
     def size(self, query: MapQuery[Any]) -> int:
         """Approximate size of the answer and its making [bytes]."""
         if not isinstance(query, RegionQuery):
@@ -178,14 +194,14 @@ class Answers:
     def _at(self, places: Floats, names: tuple[str, ...], query: Compared[Any]) -> PointsAnswer:
         """Layers of the cells at places (n, 2), minus those of another time if the query asks for it."""
         cells = self._site.geometry.cell_of(places)
-        looks = (self._look_at_cells(cells, names, as_of_ns, repairs=query.repairs) for as_of_ns in query.times)
-        (layers, look), *others = looks
-        version = look.version
-        for older, its_look in others:
+        (layers, version, stamp_ns), *others = (
+            self._layers_at(cells, names, as_of_ns, repairs=query.repairs) for as_of_ns in query.times
+        )
+        for older, its_version, _ in others:
             layers = {name: values - older[name] for name, values in layers.items()}
-            version = replace(version, row=min(version.row, its_look.version.row))
+            version = replace(version, row=min(version.row, its_version.row))
         x_m, y_m = ((cells + 0.5) * self._site.cell_m).T
-        return PointsAnswer(x_m, y_m, layers, version, look.stamp_ns)
+        return PointsAnswer(x_m, y_m, layers, version, stamp_ns)
 
     def region(self, query: RegionQuery) -> Region:
         """Layers of an area, or its first piece; `piece` has the others."""
@@ -199,8 +215,8 @@ class Answers:
         pieces = PieceGrid.of_layers(window, len(names), count)
         if pieces.count > 1:
             self._open.make_room()
-        reading = replace(self._reading(finer(window, count), names, query), window=window)
-        reading = replace(reading, count=count, outline=outline)
+        sources = self._sources(finer(window, count), names, query)
+        reading = RegionReading(window, names, sources, count, outline, query.reads_past)
         if pieces.count == 1:
             return self._read(reading, window)
         return self._piece(reading, pieces, 0, self._open.open(reading))
@@ -231,41 +247,60 @@ class Answers:
         return cut(kept, query.place)
 
     def _tiles_as_of(self, as_of_ns: int) -> TilesAnswer:
-        bounds, version = self._source.run(lambda state: (state.grid.bounds(), state.version))
-        if bounds is None:
-            return TilesAnswer(version, as_of_ns, self._site.cell_m, whole=True, tiles=())
-        west, south, east, north = bounds
-        view = self._view(CellWindow(west, south, east - west, north - south), as_of_ns)
-        return tiles_of(view, self._layers)
+        version, views = self._past_parts(None, as_of_ns)
+        tiles = tuple(tile for window, view in views for tile in tiles_of(view, window, self._layers))
+        return TilesAnswer(version, as_of_ns, self._site.cell_m, whole=True, tiles=tiles)
 
     def why(self, query: WhyQuery) -> CellReasons:
         """All that is known of a cell."""
         window = self._cell(query.x_m, query.y_m)
         if query.repairs:
             view = self._roads.view(window, self._reach, query.as_of_ns)
+        elif query.as_of_ns is None:
+            view = self._source.run(lambda state: view_now(state, window))
         else:
-            view = self._view(window, query.as_of_ns)
+            version, facts = self._source.run(lambda state: (state.version, state.facts))
+            view = self._past.view(window, query.as_of_ns, facts, version)
         names = self._source.run(_names_in)
         return reasons(view, (window.column, window.row), names, self._site.cell_m, self._config)
 
     def coverage(self, query: CoverageQuery) -> Coverage:
         """Driven and known ground."""
-        names = self._source.run(_names_in)
-        view, window = self._known(query.bounds, query.as_of_ns)
-        return coverage(view, window, names, self._site.cell_m, self._config)
+        names, window = self._source.run(_names_in), self._window_of(query.bounds)
+        if query.as_of_ns is None:
+            view = self._known(window)
+            version, views, stamp_ns = view.version, iter([(window, view)]), view.stamp_ns
+        else:
+            (version, views), stamp_ns = self._past_parts(window, query.as_of_ns), query.as_of_ns
+        return coverage(views, version, stamp_ns, names, self._site.cell_m, self._config)
 
     def lanes(self, query: LanesQuery) -> LanesAnswer:
         """Metres driven by heading."""
-        view, window = self._known(query.bounds)
-        return read_lanes(view, window, query.since_ns, self._site.cell_m, self._config)
+        window = self._window_of(query.bounds)
+        return read_lanes(self._known(window), window, query.since_ns, self._site.cell_m, self._config)
 
-    def _known(self, bounds: Bounds | None, as_of_ns: int | None = None) -> tuple[View, CellWindow | None]:
-        """View and cells of a rectangle, or the whole map; refuses too much."""
-        window = self._site.geometry.window(bounds) if bounds else None
-        west, south, east, north = self._source.run(lambda state: state.grid.bounds()) or (0, 0, 1, 1)
-        area = window or CellWindow(west, south, east - west, north - south)
-        self._source.run(lambda state: check_past(state, area, self._reach))
-        return self._view(area, as_of_ns), window
+    def _window_of(self, bounds: Bounds | None) -> CellWindow | None:
+        """Cells of a rectangle; None for all."""
+        return self._site.geometry.window(bounds) if bounds else None
+
+    def _known(self, window: CellWindow | None) -> View:
+        """The present view of a window, or the whole map; refuses too much."""
+
+        def look(state: MapState) -> View:
+            area = window or bounds_of(state)
+            check_blocks(len(state.grid.blocks_in(area)), "ask for less with `bounds`")
+            return view_now(state, area)
+
+        return self._source.run(look)
+
+    def _past_parts(
+        self, window: CellWindow | None, as_of_ns: int
+    ) -> tuple[MapVersion, Iterator[tuple[CellWindow, View]]]:
+        """A past map of a window, or the whole one, part by part: never all of it is in memory."""
+        version, facts, parts = self._source.run(
+            lambda state: (state.version, state.facts, parts_of(state, window or bounds_of(state)))
+        )
+        return version, ((part, self._past.view(part, as_of_ns, facts, version)) for part in parts)
 
     def _version(self) -> MapVersion:
         return self._source.run(lambda state: state.version)
@@ -279,21 +314,38 @@ class Answers:
         count = cells_to_a_side(query.resolution_m, self._site.cell_m)
         return GridGeometry(count * self._site.cell_m).window(query.bounds), count
 
-    def _reading(self, window: CellWindow, names: tuple[str, ...], query: Compared[Any]) -> RegionReading:
-        looks = (self._look(window, names, as_of_ns, repairs=query.repairs) for as_of_ns in query.times)
-        return RegionReading(window, names, tuple(looks))
+    def _sources(self, window: CellWindow, names: tuple[str, ...], query: Compared[Any]) -> tuple[LookAt, ...]:
+        """Where pieces of a window come from: one look, or of the past one each, as its evidence is not shared."""
+        version, facts = self._source.run(lambda state: (state.version, state.facts))
 
-    def _look_at_cells(
+        def source(as_of_ns: int | None) -> LookAt:
+            if as_of_ns is None or query.repairs:
+                look = self._look(window, names, as_of_ns, repairs=query.repairs)
+                return lambda _: look
+            return lambda piece: self._look_back(piece, names, as_of_ns, facts, version)
+
+        return tuple(map(source, query.times))
+
+    def _layers_at(
         self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
-    ) -> tuple[dict[str, Floats32], Look]:
-        """Layers (n,) of cells (n, 2) [column, row], and their source."""
+    ) -> tuple[dict[str, Floats32], MapVersion, int]:
+        """Layers (n,) of cells (n, 2) [column, row], their map's version and time."""
         if as_of_ns is None:
             look = self._now(lambda state: self._layers.look_cells(state, cells, names), repairs=repairs)
-        else:
-            first, last = cells.min(axis=0), cells.max(axis=0)
-            window = CellWindow(*first.tolist(), *(last - first + 1).tolist())
-            look = self._look(window, names, as_of_ns, repairs=repairs)
-        return self._layers.at_cells(look, cells, names), look
+            return self._layers.at_cells(look, cells, names), look.version, look.stamp_ns
+        window = _around(cells)
+        if repairs:
+            look = self._look(window, names, as_of_ns, repairs=True)
+            return self._layers.at_cells(look, cells, names), look.version, look.stamp_ns
+        version, facts, parts = self._source.run(lambda state: (state.version, state.facts, parts_of(state, window)))
+        out: dict[str, Floats32] = {name: np.full(len(cells), np.nan, np.float32) for name in names}
+        for part in parts:
+            inside = _is_in(cells, part)
+            if inside.any():
+                look = self._look_back(_around(cells[inside]), names, as_of_ns, facts, version)
+                for name, values in self._layers.at_cells(look, cells[inside], names).items():
+                    out[name][inside] = values
+        return out, version, as_of_ns
 
     def _look_at_squares(
         self, squares: Set[Block], names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
@@ -306,10 +358,22 @@ class Answers:
     def _look(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool) -> Look:
         if as_of_ns is None:
             return self._now(lambda state: self._layers.look(state, window, names), repairs=repairs)
-        wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
         if repairs:
-            return self._layers.look_at(self._roads.view(wide, self._reach, as_of_ns))
-        return self._layers.look_at(self._view(wide, as_of_ns))
+            return self._layers.look_at(self._roads.view(self._wide(window, names), self._reach, as_of_ns))
+        version, facts = self._source.run(lambda state: (state.version, state.facts))
+        return self._look_back(window, names, as_of_ns, facts, version)
+
+    def _look_back(
+        self, window: CellWindow, names: tuple[str, ...], as_of_ns: int, facts: Facts, version: MapVersion
+    ) -> Look:
+        """Sources of a window as of a time; refuses too much."""
+        wide = self._wide(window, names)
+        self._source.run(lambda state: check_past(state, wide, self._reach))
+        return self._layers.look_at(self._past.view(wide, as_of_ns, facts, version))
+
+    def _wide(self, window: CellWindow, names: tuple[str, ...]) -> CellWindow:
+        """With the cells around that layers depend on."""
+        return widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
 
     def _now(self, look: Callable[[MapState | StillMap], Look], *, repairs: bool) -> Look:
         """Look at the present map; repairs: at that of the newest roads, with their ages."""
@@ -319,27 +383,30 @@ class Answers:
         return replace(self._read(reading, pieces.piece(number)), piece=pieces.place(number, cursor))
 
     def _read(self, reading: RegionReading, window: CellWindow) -> Region:
-        """Layers of a window inside the reading's."""
-        fine = finer(window, reading.count)
-        newer, *others = (self._map(look, reading.layers, fine) for look in reading.looks)
+        """Layers of a window inside the reading's; means part by part."""
+        if reading.count == 1:
+            return self._cells(reading, window)
+        parts, geometry = PieceGrid.of_means(window, reading.count), GridGeometry(reading.count * self._site.cell_m)
+        layers = {name: np.empty((window.rows, window.columns), np.float32) for name in reading.layers}
+        for part in map(parts.piece, range(parts.count)):
+            cells = self._cells(reading, finer(part, reading.count))
+            row, column = part.row - window.row, part.column - window.column
+            for name, values in cells.layers.items():
+                layers[name][row : row + part.rows, column : column + part.columns] = means(values, reading.count)
+        x_m, y_m = geometry.centres(window.column, window.columns), geometry.centres(window.row, window.rows)
+        return replace(cells, x_m=x_m, y_m=y_m, cell_m=geometry.cell_m, layers=layers)
+
+    def _cells(self, reading: RegionReading, window: CellWindow) -> Region:
+        """Layers of map cells."""
+        newer, *others = (self._map(source(window), reading.layers, window) for source in reading.sources)
         layers, version = dict(newer.layers), newer.version
         for older in others:
             layers = {name: values - older[name] for name, values in layers.items()}
             version = replace(version, row=min(newer.merged, older.merged))
         if reading.outline:
-            within = inside(reading.outline, fine, self._site.cell_m)
+            within = inside(reading.outline, window, self._site.cell_m)
             layers = {name: np.where(within, values, np.float32(np.nan)) for name, values in layers.items()}
-        if reading.count == 1:
-            return replace(newer, layers=layers, version=version)
-        geometry = GridGeometry(reading.count * self._site.cell_m)
-        return replace(
-            newer,
-            x_m=geometry.centres(window.column, window.columns),
-            y_m=geometry.centres(window.row, window.rows),
-            cell_m=geometry.cell_m,
-            layers={name: means(values, reading.count) for name, values in layers.items()},
-            version=version,
-        )
+        return replace(newer, layers=layers, version=version)
 
     def _map(self, look: Look, names: tuple[str, ...], window: CellWindow) -> Region:
         geometry = self._site.geometry
@@ -352,12 +419,6 @@ class Answers:
             stamp_ns=look.stamp_ns,
         )
 
-    def _view(self, window: CellWindow, as_of_ns: int | None) -> View:
-        if as_of_ns is None:
-            return self._source.run(lambda state: view_now(state, window))
-        self._source.run(lambda state: check_past(state, window, self._reach))
-        return self._past.view(window, as_of_ns, self._source.run(lambda state: state.facts))
-
     def _spans(self, past: CellHistory, names: tuple[str, ...]) -> tuple[HistorySpan, ...]:
         values = cell_layers.read(past.evidence, names, self._config.read, past.last_ns[:, None])
         columns = (past.first_ns.tolist(), past.last_ns.tolist(), *(values[name][:, 0].tolist() for name in names))
@@ -365,6 +426,18 @@ class Answers:
             HistorySpan(first_ns, last_ns, dict(zip(names, of_span, strict=True)))
             for first_ns, last_ns, *of_span in zip(*columns, strict=True)
         )
+
+
+def _around(cells: Ints) -> CellWindow:
+    """The least window with cells (n, 2)."""
+    first, last = cells.min(axis=0), cells.max(axis=0)
+    return CellWindow(*first.tolist(), *(last - first + 1).tolist())
+
+
+def _is_in(cells: Ints, window: CellWindow) -> Bools:
+    """Which cells (n, 2) a window has."""
+    place = cells - (window.column, window.row)
+    return np.asarray(((place >= 0) & (place < (window.columns, window.rows))).all(axis=1))
 
 
 def _names_in(state: MapState) -> list[str]:

@@ -15,6 +15,7 @@ from mapserver.layers import cell_layers
 from mapserver.query.cell_reasons import machine_bits
 from mapserver.query.views import View
 from protocol.arrays import Bools
+from protocol.queries.answers import MapVersion
 from protocol.queries.coverage import Coverage
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
@@ -23,29 +24,35 @@ LAYERS = ("visits", "resistance")
 
 
 def coverage(
-    view: View, window: CellWindow | None, names: Iterable[str], cell_m: float, config: ServerConfig
+    parts: Iterable[tuple[CellWindow | None, View]],
+    version: MapVersion,
+    stamp_ns: int,
+    names: Iterable[str],
+    cell_m: float,
+    config: ServerConfig,
 ) -> Coverage:
-    """Count cells of a window or the whole view; names: of machines in the map."""
+    """Count cells of windows, each in its view; None: all of it. names: of machines in the map."""
     bits = machine_bits(names)
-    since_ns = {name: view.stamp_ns - seconds * 10**9 for name, seconds in SINCE_S.items()}
+    since_ns = {name: stamp_ns - seconds * 10**9 for name, seconds in SINCE_S.items()}
     counts = dict.fromkeys(("driven", "known", *since_ns, *(f"by {name}" for name in bits)), 0)
-    first = valid_pages(view.pages, cell_m, config.change, view.ages)
-    for some in chunks([block for block in view.pages if window is None or _within(block, window).any()]):
-        sums = evidence([view.pages[block] for block in some], [first[block] for block in some])
-        layers = cell_layers.read(sums, LAYERS, config.read)
-        inside = np.stack([_within(block, window) for block in some])
-        driven = (layers["visits"] > 0) & inside
-        cells = {"driven": driven, "known": np.isfinite(layers["resistance"]) & inside}
-        cells |= {name: driven & (sums.newest_ns >= begin_ns) for name, begin_ns in since_ns.items()}
-        machines = sums.bitmaps[..., ev.MACHINES]
-        cells |= {f"by {name}": driven & ((machines & bit) > 0) for name, bit in bits.items()}
-        counts = {name: counts[name] + int(chosen.sum()) for name, chosen in cells.items()}
+    for window, view in parts:
+        first = valid_pages(view.pages, cell_m, config.change, view.ages)
+        for some in chunks([block for block in view.pages if window is None or _within(block, window).any()]):
+            sums = evidence([view.pages[block] for block in some], [first[block] for block in some])
+            layers = cell_layers.read(sums, LAYERS, config.read)
+            inside = np.stack([_within(block, window) for block in some])
+            driven = (layers["visits"] > 0) & inside
+            cells = {"driven": driven, "known": np.isfinite(layers["resistance"]) & inside}
+            cells |= {name: driven & (sums.newest_ns >= begin_ns) for name, begin_ns in since_ns.items()}
+            machines = sums.bitmaps[..., ev.MACHINES]
+            cells |= {f"by {name}": driven & ((machines & bit) > 0) for name, bit in bits.items()}
+            counts = {name: counts[name] + int(chosen.sum()) for name, chosen in cells.items()}
     area = {name: count * cell_m**2 for name, count in counts.items()}
     return Coverage(
-        store=view.version.store,
-        merged=view.version.row,
-        fact=view.version.fact,
-        stamp_ns=view.stamp_ns,
+        store=version.store,
+        merged=version.row,
+        fact=version.fact,
+        stamp_ns=stamp_ns,
         driven_m2=area["driven"],
         known_m2=area["known"],
         driven_since_m2={name: area[name] for name in since_ns},

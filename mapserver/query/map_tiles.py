@@ -27,7 +27,7 @@ from mapserver.query.views import StillMap, View
 from protocol.arrays import Ints
 from protocol.queries.answers import MapVersion
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, Plane, TilesAnswer, TilesQuery
-from protocol.site.geometry import BLOCK_CELLS
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 LAYERS = (*list(PLANES)[:-1], "newest_ns")  # `since` follows from it
 AT_ONCE = 64  # tiles looked at together: 1024 blocks, 10 ms of the map's owner
@@ -187,12 +187,15 @@ def _place(tile: MapTile) -> Place:
     return tile.x, tile.y
 
 
-def tiles_of(view: View, layers: BlockLayers) -> TilesAnswer:
-    """All tiles of a view."""
-    look, version = layers.look_at(view), view.version
-    tiles = tuple(
-        drawing.tile(place, version)
-        for some in _few(sorted({_tile_of(block) for block in look.cell_states}))
-        for place, drawing in sorted(draw({}, of_tiles(layers, look, some)).items())
-    )
-    return TilesAnswer(version, view.stamp_ns, layers.cell_m, whole=True, tiles=tiles)
+def tiles_of(view: View, window: CellWindow, layers: BlockLayers) -> Iterator[MapTile]:
+    """Tiles of a view in a window, whose edges are tiles' where the view goes on."""
+    look, n = layers.look_at(view), BLOCK_CELLS
+    inside = CellWindow(window.column // n, window.row // n, -(-window.columns // n), -(-window.rows // n))
+    places = {_tile_of(block) for block in look.cell_states if _is_in(block, inside)}
+    for some in _few(sorted(places)):
+        for place, drawing in sorted(draw({}, of_tiles(layers, look, some)).items()):
+            yield drawing.tile(place, view.version)
+
+
+def _is_in(block: Block, blocks: CellWindow) -> bool:
+    return 0 <= block[0] - blocks.column < blocks.columns and 0 <= block[1] - blocks.row < blocks.rows

@@ -200,7 +200,7 @@ class MapQueryable:
             name, parameters = question(asked)
             query = parse_query(name, parameters)
             pool, size = self._large if query.is_long else self._now, self._answers.size(query)
-            if query.reads_past:
+            if self._answers.reads_past(query):
                 pool, size = self._past, 1
         except QueryError as error:
             self._replies.refuse(asked, error)

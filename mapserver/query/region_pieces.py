@@ -2,6 +2,7 @@
 
 An answer is small enough for the router to hold it for a slow reader (protocol/wire/session.py), so nobody else waits.
 All pieces are of one map version, so its pages are kept, at little cost: they are immutable, and shared with the grid.
+Those of the past are not: each piece folds its own.
 """
 
 from __future__ import annotations
@@ -10,18 +11,20 @@ import math
 import secrets
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
 from mapserver.query.block_layers import Look
-from mapserver.query.views import MOST_BLOCKS
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import Piece
 from protocol.queries.places import Place
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 PIECE_BYTES = 256 * 256 * 3 * 4  # largest answer: three layers of 256 x 256 cells
+LookAt = Callable[[CellWindow], Look]  # sources of a piece, in map cells
+MEAN_CELLS = 2**19  # map cells averaged at once, or a larger cell: means take 20 bytes each
 READ_BYTES = 2**24  # most cell layers read per answer, if larger cells are their means
 MOST_OPEN = 16  # regions read at the same time
 IDLE_S = 30.0  # time without a request that drops a region; a piece takes 20 s at 300 kbit/s
@@ -32,19 +35,16 @@ OPEN_S = 600.0  # time that drops an open region, as its pages leave the grid
 class RegionReading:
     """Sources of a region: layers, and a map, or the difference of two.
 
-    window: in the answer's cells, `count` map cells to a side. outline: unknown outside.
+    window: in the answer's cells, `count` map cells to a side. outline: unknown outside. is_past: pieces are folded
+    from the journal.
     """
 
     window: CellWindow
     layers: tuple[str, ...]
-    looks: tuple[Look, ...]
+    sources: tuple[LookAt, ...]
     count: int = 1
     outline: tuple[Place, ...] = ()
-
-    @property
-    def past_blocks(self) -> int:
-        """Blocks of past maps, whose pages are not shared."""
-        return sum(len(look.pages) for look in self.looks if look.grid is None)
+    is_past: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,12 @@ class PieceGrid:
         if window.columns < side:
             return cls(window, window.columns + step, _whole(cells // window.columns, step), step)
         return cls(window, _whole(side, step), _whole(side, step), step)
+
+    @classmethod
+    def of_means(cls, window: CellWindow, count: int) -> PieceGrid:
+        """Parts of a window whose cells are averaged at once."""
+        side = max(1, math.isqrt(MEAN_CELLS) // count)
+        return cls(window, side, side, step=1)
 
     @property
     def count(self) -> int:
@@ -132,24 +138,20 @@ class OpenRegions:
         self._lock = threading.Lock()
         self._open: dict[int, _Open] = {}
 
-    def make_room(self, past_blocks: int = 0) -> None:
-        """Drop finished and abandoned regions; QueryError if too many, or too much of the past, are being read."""
+    def make_room(self) -> None:
+        """Drop finished and abandoned regions; QueryError if too many are being read."""
         with self._lock:
             self._forget()
-            while self._is_full(past_blocks):
+            while len(self._open) >= MOST_OPEN:
                 read = next((cursor for cursor, one in self._open.items() if one.is_read), None)
                 if read is None:
                     problem = f"{len(self._open)} large regions are being read; ask again later, or for a smaller one"
                     raise QueryError(Refusal.OVERLOADED, problem, retry_after_s=2.0)
                 del self._open[read]
 
-    def _is_full(self, past_blocks: int) -> bool:
-        kept = sum(one.reading.past_blocks for one in self._open.values())
-        return len(self._open) >= MOST_OPEN or bool(past_blocks and kept and kept + past_blocks > MOST_BLOCKS)
-
     def open(self, reading: RegionReading) -> int:
         """Keep a region's sources; returns its cursor. QueryError as `make_room`."""
-        self.make_room(reading.past_blocks)
+        self.make_room()
         cursor, now_s = 1 + secrets.randbelow(2**48), time.monotonic()
         with self._lock:
             self._open[cursor] = _Open(reading, now_s, now_s)
@@ -167,6 +169,15 @@ class OpenRegions:
                 raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `number`: {number} of {pieces.count} pieces, from 0")
             one.used_s, one.is_read = time.monotonic(), one.is_read or number == pieces.count - 1
             return one.reading, pieces
+
+    def is_past(self, cursor: int) -> bool:
+        """Whether an open region is of the past, whose next piece may wait for its turn."""
+        with self._lock:
+            one = self._open.get(cursor)
+            if one is None or not one.reading.is_past:
+                return False
+            one.used_s = time.monotonic()
+            return True
 
     def _forget(self) -> None:
         now_s = time.monotonic()

@@ -30,18 +30,47 @@ from protocol.arrays import AnyArray, Floats32, Ints
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import MapVersion
 from protocol.queries.lanes import LanesAnswer
+from protocol.queries.map_tiles import TILE_CELLS
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-# Blocks of known ground per query, 4 km2 with 1 m cells: 0.2 s of the map's owner, up to 190 MB of past pages.
-MOST_BLOCKS = 16_384
+MOST_BLOCKS = 16_384  # of known ground per query, 4 km2 with 1 m cells: 0.2 s of the map's owner
+# Present evidence [bytes] where a past map is folded, which takes up to 1.2 times of it: at most, and in a part.
+PAST_BYTES, PART_BYTES = 2**27, 2**25
 
 
 def check_past(state: MapState, window: CellWindow | None, reach: int) -> None:
-    """Refuse a past map of too much known ground; window: None for all. On the map's thread."""
+    """Refuse a past map of too much evidence at once; window: None for all. On the map's thread."""
+    area = bounds_of(state) if window is None else surroundings(window, reach)
+    size = state.grid.size(state.grid.blocks_in(area))
+    if size > PAST_BYTES:
+        problem = f"it reads {size / 1e6:.0f} MB of evidence of the past at once, over {PAST_BYTES / 1e6:.0f}"
+        instead = "ask for a `region` of a part, with `bounds` and `as_of`; or ask for the map as it is"
+        raise QueryError(Refusal.TOO_LARGE, f"{problem}: {instead}")
+
+
+def bounds_of(state: MapState) -> CellWindow:
+    """All cells with evidence; one without any."""
     west, south, east, north = state.grid.bounds() or (0, 0, 1, 1)
-    area = CellWindow(west, south, east - west, north - south) if window is None else surroundings(window, reach)
-    instead = "of the past ask for a `region` of a part, with `bounds` and `as_of`; or ask for the map as it is"
-    check_blocks(len(state.grid.blocks_in(area)), instead)
+    return CellWindow(west, south, east - west, north - south)
+
+
+def parts_of(state: MapState, window: CellWindow) -> list[CellWindow]:
+    """Parts of a window with at most PART_BYTES of evidence each, or a tile. On the map's thread."""
+    size = state.grid.size(state.grid.blocks_in(window))
+    if size <= PART_BYTES or max(window.columns, window.rows) <= TILE_CELLS:
+        return [window]
+    return [part for half in _halves(window) for part in parts_of(state, half)]
+
+
+def _halves(window: CellWindow) -> tuple[CellWindow, CellWindow]:
+    """Cut the longer side between tiles."""
+    first, count = max((window.column, window.columns), (window.row, window.rows), key=lambda side: side[1])
+    middle = max((first + count // 2) // TILE_CELLS, first // TILE_CELLS + 1) * TILE_CELLS - first
+    if window.columns == count:
+        east = CellWindow(window.column + middle, window.row, count - middle, window.rows)
+        return CellWindow(window.column, window.row, middle, window.rows), east
+    north = CellWindow(window.column, window.row + middle, window.columns, count - middle)
+    return CellWindow(window.column, window.row, window.columns, middle), north
 
 
 def check_blocks(count: int, instead: str) -> None:
@@ -119,11 +148,11 @@ class PastMaps:
     past: StorePast
     config: ServerConfig
 
-    def view(self, window: CellWindow, stamp_ns: int, facts: Facts) -> View:
-        """The map from samples stamped up to stamp_ns, possibly with rows committed meanwhile."""
+    def view(self, window: CellWindow, stamp_ns: int, facts: Facts, version: MapVersion) -> View:
+        """The map from a version's samples stamped up to stamp_ns. facts: the version's."""
         reach = reach_blocks(self.past.cell_m, self.config.change)
-        with self._reader(facts) as (reader, version):
-            grid = self.past.grid_as_of(reader, stamp_ns, surroundings(window, reach), facts)
+        with self._reader(facts) as (reader, _):
+            grid = self.past.grid_as_of(reader, stamp_ns, surroundings(window, reach), facts, version.row)
         return View(_pages(grid, window, reach), version, stamp_ns)
 
     def history(

@@ -63,10 +63,11 @@ def encode_lanes(answer: LanesAnswer) -> bytes:
     """Numbers of the squares as columns, all metres deflated together."""
     version, tiles = answer.version, answer.tiles
     columns = {name: np.array([getattr(tile, name) for tile in tiles], "<i8").tobytes() for name, _, _ in HEAD}
-    metres = b"".join(tile.metres.tobytes() for tile in tiles)
+    deflating = zlib.compressobj()
+    metres = b"".join([*(deflating.compress(tile.metres.tobytes()) for tile in tiles), deflating.flush()])
     table = {"store": version.store, "row": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
     head = {"cell_m": answer.cell_m, "n": len(tiles), "cols": columns}
-    return pack({**table, **head, "metres": zlib.compress(metres)})
+    return pack({**table, **head, "metres": metres})
 
 
 def decode_lanes(data: bytes) -> LanesAnswer:
@@ -83,16 +84,18 @@ def decode_lanes(data: bytes) -> LanesAnswer:
     return LanesAnswer(version, take_int(table, "stamp_ns", 0, MAX_STAMP_NS), cell_m, tiles)
 
 
+STROKES = ("x_m", "y_m", "heading_rad", "metres")
+
+
 def strokes(answer: LanesAnswer) -> dict[str, Floats]:
     """Driven cells as columns: centre [m], main heading [rad], metres in it."""
     steps = np.array([tile.metres for tile in answer.tiles], np.uint8).reshape(-1, *SHAPE)
-    metres = np.nan_to_num(SCALE_M.values())[steps]
-    most = metres.max(axis=1)
+    most = steps.max(axis=1)
     tile, cell = np.nonzero(most)
     corner = np.array([(each.x, each.y) for each in answer.tiles], np.int64).reshape(-1, 2)[tile] * BLOCK_CELLS
     place_m = (corner + np.stack([cell % BLOCK_CELLS, cell // BLOCK_CELLS], axis=1) + 0.5) * answer.cell_m
-    heading_rad = metres.argmax(axis=1)[tile, cell] * (2 * np.pi / SECTORS)
-    return {"x_m": place_m[:, 0], "y_m": place_m[:, 1], "heading_rad": heading_rad, "metres": most[tile, cell]}
+    heading_rad = steps.argmax(axis=1)[tile, cell] * (2 * np.pi / SECTORS)
+    return dict(zip(STROKES, (*place_m.T, heading_rad, SCALE_M.values()[most[tile, cell]]), strict=True))
 
 
 def _column(cols: dict[str, object], name: str, n: int, low: int, high: int) -> list[int]:

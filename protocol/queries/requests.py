@@ -112,6 +112,11 @@ class PieceQuery(MapQuery[answers.Region]):
     ask_first = AskFirst.SERVER_ALONE
     size = Size.PIECE
 
+    @property
+    def may_read_journal(self) -> bool:
+        """See `MapQuery`: for a region of the past."""
+        return True
+
 
 @dataclass(frozen=True)
 class HistoryQuery(Fresh[answers.HistoryAnswer]):

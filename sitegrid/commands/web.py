@@ -11,7 +11,7 @@ from protocol.errors import ConfigError
 from protocol.wire.keys import check_name
 from sitegrid.options.groups import add_network
 from sitegrid.options.values import address
-from sitegrid.process.lifetime import stop_flag
+from sitegrid.process.lifetime import return_large_blocks, stop_flag
 
 EXTRA = "web"
 HELP = "show the map in browsers, and to other tools over HTTP"
@@ -48,6 +48,7 @@ def run(arguments: Namespace) -> int:
         problem = f"{host} is reached from other hosts: {advice}"
         raise ConfigError("--listen", problem)
     stop = stop_flag()
+    return_large_blocks()
     with ExitStack() as opened:
         sites = arguments.sites or [(None, None)]
         return serve(opened, [(name, at or arguments.endpoint) for name, at in sites], (host, port), arguments, stop)

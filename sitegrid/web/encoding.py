@@ -9,9 +9,9 @@ import asyncio
 import json
 import struct
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, fields, is_dataclass
 from functools import partial
 from itertools import chain
@@ -21,6 +21,7 @@ import numpy as np
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from protocol.arrays import AnyArray
 from protocol.errors import QueryError, Refusal
 from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
 from sitegrid.web.values import plain, with_times
@@ -34,30 +35,40 @@ LARGE_S = 300.0  # timeout of a large answer: 64 MB at 2 Mbit/s
 _pool = ThreadPoolExecutor(THREADS, thread_name_prefix="encode")
 
 
-def _nothing() -> None:
-    pass
-
-
 async def beside(work: Callable[..., T], *arguments: Any) -> T:
     """Run CPU work on one of a few threads."""
     return await asyncio.get_running_loop().run_in_executor(_pool, partial(work, *arguments))
 
 
-async def as_json(value: Any, media: str = "application/json", done: Callable[[], None] = _nothing) -> Response:
-    """Records, arrays, tables, lists and iterators as JSON. done: see `answered`."""
-    return await answered(pieces(value), media, done)
+async def as_json(value: Any, media: str = "application/json") -> Response:
+    """Records, arrays, tables, lists, columns and iterators as JSON."""
+    return await answered(pieces(value), media)
 
 
-async def answered(parts: Iterator[bytes], media: str, done: Callable[[], None] = _nothing) -> Response:
-    """An answer in parts; long ones are encoded while sent. done: releases its room; by default taken here."""
+async def answered(parts: Iterator[bytes], media: str) -> Response:
+    """An answer in parts; long ones are encoded while sent."""
     first = await beside(_begin, parts)
-    if done is _nothing:
-        if len(first) <= PIECE:
-            return Response(first, media_type=media)
-        done = ROOM.take(len(first))
-    response = Large(chain((first,), parts), media, done)
+    if len(first) <= PIECE:
+        return Response(first, media_type=media)
+    response = Large(chain((first,), parts), media)
+    response.hold(len(first))
     if len(first) < WHOLE:
         response.headers["Content-Length"] = str(len(first))
+    return response
+
+
+async def in_room(size: int, making: Callable[[], Awaitable[Response]]) -> Response:
+    """Make a response that holds `size` bytes until it is sent; QueryError without room."""
+    done = ROOM.take(size)
+    try:
+        response = await making()
+    except BaseException:
+        done()
+        raise
+    if isinstance(response, Large):
+        response.at_end(done)
+    else:
+        done()
     return response
 
 
@@ -72,6 +83,17 @@ def _begin(parts: Iterator[bytes]) -> bytes:
 async def _made(texts: Iterator[bytes]) -> AsyncIterator[bytes]:
     while (text := await beside(next, texts, None)) is not None:
         yield text
+
+
+class Column(Iterator[AnyArray]):
+    """A long list of numbers in arrays (n,), made one after the other."""
+
+    def __init__(self, arrays: Iterator[AnyArray]) -> None:
+        self._arrays = arrays
+
+    def __next__(self) -> AnyArray:
+        """The next array with any."""
+        return next(array for array in self._arrays if len(array))
 
 
 def pieces(value: Any) -> Iterator[bytes]:
@@ -108,6 +130,9 @@ def _texts(value: Any) -> Iterator[str]:
 
 def _parts(value: Any) -> Iterator[Iterator[str]]:
     """A list's content: many numbers at once, containers one by one."""
+    if isinstance(value, Column):
+        yield from chain.from_iterable(map(_parts, value))
+        return
     if isinstance(value, Iterator) or (len(value) and not isinstance(value, np.ndarray) and _holds_more(value[0])):
         yield from map(_texts, value)
         return
@@ -121,7 +146,7 @@ def _holds_more(item: Any) -> bool:
     return isinstance(item, Mapping | list | tuple | np.ndarray | Iterator) or is_dataclass(item)
 
 
-def frame(answer: TilesAnswer) -> bytes:
+def framed(answer: TilesAnswer) -> Iterator[bytes]:
     """Tiles for a page: length of a JSON head (4 bytes, big-endian), head, deflated planes."""
     head = {
         "store": answer.version.store,
@@ -135,7 +160,7 @@ def frame(answer: TilesAnswer) -> bytes:
         "tiles": [_head(tile) for tile in answer.tiles],
     }
     text = json.dumps(head, separators=(",", ":")).encode()
-    return b"".join([struct.pack(">I", len(text)), text, *(tile.planes for tile in answer.tiles)])
+    return chain((struct.pack(">I", len(text)), text), (tile.planes for tile in answer.tiles))
 
 
 def _head(tile: MapTile) -> dict[str, Any]:
@@ -147,10 +172,14 @@ class Room:
     """Bounded room for large answers in flight, in the caller's unit."""
 
     def __init__(self, most: int) -> None:
-        self._free = most
+        self._most = self._free = most
 
     def take(self, size: int) -> Callable[[], None]:
-        """Take room; returns its release. QueryError if there is too little. On the loop's thread."""
+        """Take room; returns its release. QueryError if there is too little. On the loop's thread.
+
+        What exceeds all room takes all of it.
+        """
+        size = min(size, self._most)
         if size > self._free:
             raise QueryError(Refusal.OVERLOADED, "too many large answers are being taken; ask again later, or for less")
         self._free -= size
@@ -165,19 +194,24 @@ ROOM = Room(2**27)  # bytes, for all visitors
 
 
 class Large(StreamingResponse):
-    """A large answer, cut off for slow clients. done: called at the end."""
+    """A large answer, cut off for slow clients."""
 
-    def __init__(self, texts: Iterator[bytes], media: str, done: Callable[[], None]) -> None:
+    def __init__(self, texts: Iterator[bytes], media: str) -> None:
         super().__init__(_made(texts), media_type=media)
-        self._done = done
+        self._ends = ExitStack()
+
+    def at_end(self, done: Callable[[], None]) -> None:
+        """Call `done` once it is sent, or given up."""
+        self._ends.callback(done)
+
+    def hold(self, size: int) -> None:
+        """Take room until the end; QueryError if there is too little."""
+        self.at_end(ROOM.take(size))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send it."""
-        try:
-            with suppress(TimeoutError):
-                await asyncio.wait_for(super().__call__(scope, receive, send), LARGE_S)
-        finally:
-            self._done()
+        with self._ends, suppress(TimeoutError):
+            await asyncio.wait_for(super().__call__(scope, receive, send), LARGE_S)
 
 
 class Cache(OrderedDict[Any, T]):

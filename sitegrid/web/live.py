@@ -1,7 +1,7 @@
 """Live connection of a page: always the current map, never a queue.
 
-A page states its version and gets the difference. The next follows once it is acknowledged, so slow pages get newer
-maps less often, at no memory cost.
+A page states its version and gets the difference, in parts. The next follows once one is acknowledged, so slow pages
+get newer maps less often, at the memory of one part.
 """
 
 from __future__ import annotations
@@ -9,18 +9,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from protocol.queries.answers import MapVersion
-from sitegrid.web.encoding import beside, frame
+from protocol.queries.map_tiles import MapTile, TilesAnswer
+from sitegrid.web.encoding import beside, framed
 from sitegrid.web.site import POSES_S, SiteFeed
 
 TAKEN_S = 30.0  # a page that acknowledges nothing for this long is disconnected; it reconnects
 QUIET_S = 1.0  # longest interval between poses
 NO_PERMISSION, TOO_SLOW = 4401, 4408
+PART_BYTES = 2**18  # of tiles per message: 250 pages that take nothing hold 64 MB
 AWAY = json.dumps({"state": "away"})
 
 
@@ -45,6 +49,7 @@ class _Page:
         self._socket, self._door, self._version = socket, feed, version
         self._may_stay: Callable[[], bool] = socket.scope.get("may_stay", lambda: True)  # see Guard
         self._sent: MapVersion | None = None  # in flight
+        self._parts: deque[TilesAnswer] = deque()  # of a difference, to be sent
         self._sent_s = 0.0
         self._taken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._state = ""
@@ -84,12 +89,15 @@ class _Page:
         if state != self._state:
             self._state = state
             await self._timely(socket.send_text(state))
-        if self._sent is None and not feed.is_away and (answer := feed.since(self._version)):
+        if not self._parts and self._sent is None and not feed.is_away and (answer := feed.since(self._version)):
             if answer.tiles or answer.whole:
-                self._sent, self._sent_s = answer.version, now_s
-                await self._timely(socket.send_bytes(await beside(frame, answer)))
+                self._parts.extend(parts_of(answer, self._version))
             else:
                 self._version = answer.version  # nothing on the page differs
+        if self._parts and self._sent is None:
+            part = self._parts.popleft()
+            self._sent, self._sent_s = part.version, now_s
+            await self._timely(socket.send_bytes(await beside(lambda: b"".join(framed(part)))))
         if now_s - self._poses_s >= 0.9 * POSES_S and (poses := feed.poses_text()):
             self._poses_s = now_s
             await self._timely(socket.send_text(poses))
@@ -100,6 +108,24 @@ class _Page:
             await asyncio.wait_for(sending, TAKEN_S)
         except TimeoutError:
             raise WebSocketDisconnect(TOO_SLOW) from None
+
+
+def parts_of(answer: TilesAnswer, known: MapVersion | None) -> Iterator[TilesAnswer]:
+    """A difference in messages of about PART_BYTES.
+
+    All but the last have the version before, so that a page that leaves in between gets the rest.
+    """
+    before = MapVersion(answer.version.store, 0, 0) if answer.whole or known is None else known
+    tiles: list[MapTile] = []
+    whole, size = answer.whole, 0
+    for tile in answer.tiles:
+        if size >= PART_BYTES:
+            yield replace(answer, version=before, whole=whole, tiles=tuple(tiles))
+            whole, size = False, 0
+            tiles.clear()
+        tiles.append(tile)
+        size += len(tile.planes)
+    yield replace(answer, whole=whole, tiles=tuple(tiles))
 
 
 def _version(parameters: Any) -> MapVersion | None:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from dataclasses import asdict
+import zipfile
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from starlette.responses import Response
 
+from protocol.arrays import Floats
 from protocol.errors import Refusal
 from protocol.queries.answers import MapVersion, Region
-from protocol.queries.lanes import LanesQuery, strokes
-from protocol.queries.map_tiles import TilesQuery
+from protocol.queries.lanes import STROKES, LanesAnswer, LanesQuery, strokes
+from protocol.queries.map_tiles import PLANES, TilesAnswer, TilesQuery
 from protocol.queries.parameters import WORDS, name_of
 from protocol.queries.request import MapQuery, Parameter, parameters_of
 from protocol.queries.requests import (
@@ -32,13 +35,14 @@ from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
 from sitegrid.features.feature import Collection
 from sitegrid.features.kinds import CHANGE, MACHINE, REPAIR, SEGMENT, WORK, tracks
 from sitegrid.features.zones import zones
-from sitegrid.web.encoding import PIECE, ROOM, answered, as_json, beside, frame, pieces
+from sitegrid.web.encoding import PIECE, Column, answered, as_json, framed, in_room, pieces
 from sitegrid.web.resource import Resource, as_features, of_features, of_version, version_of
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters, bad
 
 MAX_CELLS = {"json": 250_000, "npz": 4_000_000}  # of a region; 2 MB of text per layer
 MAX_VALUES = 16_000_000  # cells times layers: 64 MB
+TILES_AT_ONCE = 256  # of lanes, as columns: 2 MB
 AGES = ("age_s", "changed_s")  # layers that depend on the site's now
 
 
@@ -70,14 +74,13 @@ async def region(feed: SiteFeed, query: RegionQuery, more: Parameters) -> Respon
     if cells > (most := min(MAX_CELLS[kind], MAX_VALUES // layers)):
         problem = f"a region of about {cells} cells; at most {most} with {layers} layers as {kind}"
         raise bad(Refusal.TOO_LARGE, f"{problem}: ask for less, fewer `layers`, or larger cells with `resolution`")
-    done = ROOM.take(4 * cells * layers)
-    try:
-        answer = await feed.answer_to(query)
-        parts = await beside(_archive, answer) if kind == "npz" else pieces(_table(answer))
-        return of_version(await answered(parts, REGION_MEDIA[kind], done), answer.version)
-    except BaseException:
-        done()
-        raise
+    return await in_room(4 * cells * layers, lambda: _region(feed, query, kind))
+
+
+async def _region(feed: SiteFeed, query: RegionQuery, kind: str) -> Response:
+    answer = await feed.answer_to(query)
+    parts = _archive(answer) if kind == "npz" else pieces(_table(answer))
+    return of_version(await answered(parts, REGION_MEDIA[kind]), answer.version)
 
 
 REGION_MEDIA = {"json": "application/json", "npz": "application/x-npz"}
@@ -89,11 +92,41 @@ def _table(answer: Region) -> dict[str, Any]:
 
 
 def _archive(answer: Region) -> Iterator[bytes]:
-    """NPZ in pieces."""
-    file, version = io.BytesIO(), np.array([answer.version.row, answer.version.fact])
-    np.savez_compressed(file, x_m=answer.x_m, y_m=answer.y_m, version=version, **answer.layers)  # type: ignore[arg-type]
-    file.seek(0)
-    return iter(lambda: file.read(PIECE), b"")
+    """NPZ in pieces, compressed as they are taken."""
+    version, sink = np.array([answer.version.row, answer.version.fact]), _Sink()
+    arrays = {"x_m": answer.x_m, "y_m": answer.y_m, "version": version, **answer.layers}
+    with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
+                flat = array.reshape(-1)
+                for first in range(0, len(flat), PIECE):
+                    file.write(flat[first : first + PIECE].tobytes())
+                    if len(sink.written) >= PIECE:
+                        yield sink.taken()
+    yield sink.taken()
+
+
+class _Sink(io.RawIOBase):
+    """Bytes on their way: written to the end, taken from the beginning."""
+
+    def __init__(self) -> None:
+        self.written = bytearray()
+
+    def writable(self) -> bool:
+        """It is."""
+        return True
+
+    def write(self, data: Any) -> int:
+        """Append."""
+        self.written += data
+        return len(data)
+
+    def taken(self) -> bytes:
+        """What was written since."""
+        data = bytes(self.written)
+        self.written.clear()
+        return data
 
 
 async def history(feed: SiteFeed, query: HistoryQuery, _: Parameters) -> Response:
@@ -132,19 +165,41 @@ async def as_it_is(feed: SiteFeed, query: MapQuery[Any], _: Parameters) -> Respo
 async def lanes(feed: SiteFeed, query: LanesQuery, _: Parameters) -> Response:
     """Driven cells as columns: place, prevailing heading, metres driven so."""
     answer = await feed.answer_to(query)
-    return of_version(await as_json({**strokes(answer), "stamp_ns": answer.stamp_ns}), answer.version)
+    columns = {name: Column(_strokes(answer, name)) for name in STROKES}
+    held = sum(tile.metres.nbytes for tile in answer.tiles)
+    making = partial(as_json, {**columns, "stamp_ns": answer.stamp_ns})
+    return of_version(await in_room(held, making), answer.version)
+
+
+def _strokes(answer: LanesAnswer, name: str) -> Iterator[Floats]:
+    """A column of driven cells, some tiles at a time: all would take ten times the answer."""
+    for first in range(0, len(answer.tiles), TILES_AT_ONCE):
+        yield strokes(replace(answer, tiles=answer.tiles[first : first + TILES_AT_ONCE]))[name]
 
 
 async def tiles(feed: SiteFeed, query: TilesQuery, _: Parameters) -> Response:
     """Map tiles of 8-bit layers, as for the live page: all, since a version, or as of a time."""
-    answer = await (feed.answer_to(query) if query.as_of_ns is None else feed.tiles_as_of(query.as_of_ns))
-    return Response(await beside(frame, answer), media_type="application/octet-stream")
+    making = partial(feed.answer_to, query) if query.as_of_ns is None else partial(feed.tiles_as_of, query.as_of_ns)
+    return await in_room(await _tiles_bytes(feed), lambda: _framed(making))
+
+
+async def _framed(asking: Callable[[], Awaitable[TilesAnswer]]) -> Response:
+    return await answered(framed(await asking()), BINARY[0])
+
+
+async def _tiles_bytes(feed: SiteFeed) -> int:
+    """Upper bound of all tiles."""
+    return len(PLANES) * (await feed.info()).cells
 
 
 async def zone_features(feed: SiteFeed, query: TilesQuery, more: Parameters) -> Response:
     """Ground areas by class, as features."""
     boundaries = (await feed.info()).boundaries
-    return await as_features(feed, more, "zones", zones(await feed.answer_to(query), boundaries))
+
+    async def making() -> Response:
+        return await as_features(feed, more, "zones", zones(await feed.answer_to(query), boundaries))
+
+    return await in_room(await _tiles_bytes(feed), making)
 
 
 async def change_features(feed: SiteFeed, query: ChangesQuery, more: Parameters) -> Response:

@@ -12,7 +12,7 @@ import pytest
 
 from lab import sums
 from lab.speed import filter as filters
-from lab.speed import fleet, ingest, merge, query, restart, sim, site
+from lab.speed import fleet, ingest, merge, query, restart, sim, site, visitors
 from lab.speed.__main__ import LOADS, OPTIONS, load_of, main
 from lab.speed.measure import in_turn, scattered, track
 from protocol.errors import Refusal
@@ -31,6 +31,7 @@ SMALLEST = {
         "--hours 0.1 --queries 2",
         ["cold way", "cold as_of", "warm way", "warm as_of"],
     ),
+    "visitors": ("--queries 2", [*visitors.questions()]),
     "restart": ("--samples 1950 --hours 0.02 --runs 1", ["open, rows of 6", "fold, 2 threads", "grid", "server"]),
     "filter": ("--steps 3 --runs 1", ["stock ukf, predict", "ekf, update rate", "ukf and smoother", "agent"]),
     "sim": ("--seconds 0.5 --runs 2", ["pybullet, 1", "fast, 3"]),
@@ -51,6 +52,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "BATCHES", (6, 100))
     monkeypatch.setattr(fleet, "SPEED", 20.0)
     monkeypatch.setattr(restart, "TAIL_SAMPLES", 700)
+    monkeypatch.setattr(visitors, "KNOWN_M", 128.0)
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from sitegrid.web.xyz.mercator import SIDE_PX
 LEAST_CELLS = 3.0  # pixel edge in cells; below, a pixel shows the cell at its centre
 FILL = 1.5  # pixel edge over its coarse cells' edge: every pixel gets one at any rotation
 PART_TILES = 16  # map tiles per side of a part: a million cells per query
+ROWS_AT_ONCE = 64  # of a part, turned into pixels: 10 MB; all would take 150
 PART_CELLS = PART_TILES * TILE_CELLS
 Place = tuple[int, int, int]  # zoom, column and row of an XYZ tile
 
@@ -38,16 +39,17 @@ def draw(
     total, count = np.zeros((2, SIDE_PX * SIDE_PX))
     for bounds in _parts_in(tiles, place, pixel_m, cell_m, projection):
         region = client.region(bounds, (layer,), resolution_m=resolution_m)
-        rows, columns = np.nonzero(np.isfinite(region[layer]))
-        x_m, y_m = region.x_m[columns], region.y_m[rows]
-        column, row = _pixels(x_m, y_m, place, projection)
-        inside = (column >= 0) & (column < SIDE_PX) & (row >= 0) & (row < SIDE_PX)
-        pixel, values = (row * SIDE_PX + column)[inside], region[layer][rows, columns][inside]
-        if resolution_m is None:  # classes and directions: any one
-            total[pixel], count[pixel] = values, 1
-        else:
-            total += np.bincount(pixel, values, len(total))
-            count += np.bincount(pixel, minlength=len(count))
+        for first in range(0, len(region.y_m), ROWS_AT_ONCE):
+            values = region[layer][first : first + ROWS_AT_ONCE]
+            rows, columns = np.nonzero(np.isfinite(values))
+            column, row = _pixels(region.x_m[columns], region.y_m[first + rows], place, projection)
+            inside = (column >= 0) & (column < SIDE_PX) & (row >= 0) & (row < SIDE_PX)
+            pixel, known = (row * SIDE_PX + column)[inside], values[rows, columns][inside]
+            if resolution_m is None:  # classes and directions: any one
+                total[pixel], count[pixel] = known, 1
+            else:
+                total += np.bincount(pixel, known, len(total))
+                count += np.bincount(pixel, minlength=len(count))
     with np.errstate(invalid="ignore"):
         return np.asarray(total / count).reshape(SIDE_PX, SIDE_PX)
 

@@ -10,7 +10,8 @@ from mapserver.ingest.writer import Writer
 from mapserver.query.answering import Answers
 from mapserver.query.block_layers import BlockLayers
 from protocol.errors import QueryError, Refusal
-from protocol.queries.map_tiles import TilesQuery
+from protocol.queries.coverage import CoverageQuery
+from protocol.queries.lanes import LanesQuery
 from protocol.queries.requests import HistoryQuery, PointQuery, PointsQuery, RegionQuery, WhyQuery
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
@@ -74,14 +75,12 @@ TOO_MUCH = [
     RegionQuery(Bounds(-45, -45, 45, 45), ("visits",)),
     RegionQuery(Bounds(-45, -45, 45, 45), ("grade_east",), resolution_m=30.0),
     RegionQuery(Bounds(-45, -45, 45, 45), ("resistance_filled",)),
-    RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), as_of_ns=NOW_NS + 10**11),
     PointsQuery(tuple((x + 0.5, -x - 0.5) for x in range(-40, 40, 10)), ("visits",)),
     PointsQuery(PLACES, ("resistance_filled",)),
     RouteQuery(PLACES, repairs=False),
     WayQuery(*PLACES, repairs=False),
-    TilesQuery(as_of_ns=NOW_NS + 10**11),
-    WorklistQuery(as_of_ns=NOW_NS + 10**11),
-    SegmentsQuery(as_of_ns=NOW_NS + 10**11),
+    CoverageQuery(),
+    LanesQuery(),
 ]
 
 
@@ -91,6 +90,25 @@ def test_what_reads_too_much_known_ground_is_refused_before_it_is_read(answers, 
     monkeypatch.setattr("mapserver.query.block_layers.BlockLayers.blocks", None)
     monkeypatch.setattr("mapserver.past.past.StorePast.grid_as_of", None)
     with refused(Refusal.TOO_LARGE, "blocks .* of known ground, over 3: .*ask for"):
+        answers.answer(query)
+
+
+THEN_NS = NOW_NS + 10**11
+TOO_MUCH_PAST = [
+    RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), as_of_ns=THEN_NS),
+    RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), minus_ns=THEN_NS),
+    PointsQuery(PLACES, ("visits",), as_of_ns=THEN_NS),
+    RouteQuery(PLACES, repairs=False, as_of_ns=THEN_NS),
+    WorklistQuery(as_of_ns=THEN_NS),
+    SegmentsQuery(as_of_ns=THEN_NS),
+]
+
+
+@pytest.mark.parametrize("query", TOO_MUCH_PAST)
+def test_what_folds_too_much_evidence_of_the_past_at_once_is_refused_before(answers, query, monkeypatch):
+    monkeypatch.setattr("mapserver.query.views.PAST_BYTES", 1000)
+    monkeypatch.setattr("mapserver.past.past.StorePast.grid_as_of", None)
+    with refused(Refusal.TOO_LARGE, "MB of evidence of the past at once, over 0: ask for"):
         answers.answer(query)
 
 

@@ -10,13 +10,19 @@ from mapserver.journal.facts import Facts
 from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.location import JournalLocation
 from mapserver.layers.cell_layers import LAYERS
+from mapserver.past.past import StorePast
 from mapserver.query.answering import Answers
 from mapserver.query.server_source import CommandDesk
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.commands import TrustCommand
-from protocol.queries.requests import MAX_SPANS, HistoryQuery, PointQuery, RegionQuery
+from protocol.queries.coverage import CoverageQuery
+from protocol.queries.map_tiles import TilesQuery
+from protocol.queries.origin import SERVER
+from protocol.queries.requests import MAX_SPANS, HistoryQuery, PointQuery, PointsQuery, RegionQuery
 from protocol.site.geometry import Bounds
+from sitegrid.follower_choice import Answered
+from sitegrid.whole_answers import whole_answer
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered, answers_of
 
@@ -81,6 +87,37 @@ def test_the_map_as_of_a_time_is_that_of_a_server_that_knew_no_more(answers, ser
     np.testing.assert_allclose(then["age_s"], only["age_s"] + late_s, atol=0.01)
     assert np.isfinite(then["age_s"]).any()
     assert then.stamp_ns == stamp_ns
+
+
+def test_a_past_map_is_folded_in_parts_and_is_the_same(answers, monkeypatch):
+    stamp_ns, read = NOW_NS + 900 * S, list[int]()
+    names = tuple(name for name in NAMES if name != "heading")
+    whole = RegionQuery(BOX, names, as_of_ns=stamp_ns, minus_ns=NOW_NS + 300 * S)
+    coarse = RegionQuery(BOX, ("resistance", "resistance_filled"), resolution_m=3.0, as_of_ns=stamp_ns)
+    places = tuple((x + 0.5, 7.0 * x % 40 - 20.5) for x in range(-90, 90, 5))
+    points = PointsQuery(places, names, as_of_ns=stamp_ns, minus_ns=NOW_NS + 300 * S)
+    queries = (whole, coarse, points, TilesQuery(as_of_ns=stamp_ns), CoverageQuery(as_of_ns=stamp_ns))
+
+    def asked() -> list[object]:
+        first = [whole_answer(query, lambda one, _: Answered(answers.answer(one), SERVER)) for query in queries]
+        layers = [{name: values.tobytes() for name, values in one.layers.items()} for one in first[:3]]
+        return [*layers, first[3].tiles, first[4]]
+
+    grid_as_of = StorePast.grid_as_of
+
+    def folded(self, reader, to_ns, window, *more):
+        read.append(window.columns * window.rows)
+        return grid_as_of(self, reader, to_ns, window, *more)
+
+    monkeypatch.setattr(StorePast, "grid_as_of", folded)
+    at_once, most = asked(), max(read)
+    monkeypatch.setattr("mapserver.query.views.PART_BYTES", 1)
+    monkeypatch.setattr("mapserver.query.region_pieces.PIECE_BYTES", 16 * 16 * len(NAMES) * 4)
+    monkeypatch.setattr("mapserver.query.region_pieces.MEAN_CELLS", 100)
+    read.clear()
+    assert asked() == at_once
+    assert max(read) < 0.6 * most
+    assert len(read) > 20
 
 
 def repaved():

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from starlette.responses import Response
 
 from protocol.errors import QueryError
 from sitegrid.web import encoding
-from sitegrid.web.encoding import PIECE, Cache, Large, Room, answered, pieces
+from sitegrid.web.encoding import PIECE, Cache, Column, Large, Room, answered, in_room, pieces
 from sitegrid.web.values import plain
 
 
@@ -43,30 +44,57 @@ def test_pieces_are_the_json_of_the_whole_and_small(value: Any):
     assert b"".join(pieces(iter([value]))) == json.dumps([plain(value)]).encode()
 
 
-def test_a_large_answer_has_its_room_until_it_is_sent_or_not_taken(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(encoding, "LARGE_S", 0.05)
-    monkeypatch.setattr(encoding, "WHOLE", 2)
+@pytest.fixture
+def room(monkeypatch: pytest.MonkeyPatch) -> Room:
+    """Room for ten bytes; answers of a byte are large."""
+    for name, value in {"LARGE_S": 0.05, "WHOLE": 2, "PIECE": 0}.items():
+        monkeypatch.setattr(encoding, name, value)
     room = Room(10)
+    monkeypatch.setattr(encoding, "ROOM", room)
+    return room
 
-    async def serve(parts: list[bytes], *, takes: bool) -> None:
-        response = await answered(iter(parts), "text/plain", room.take(7))
+
+@pytest.mark.parametrize(("parts", "takes"), [([b"1"], True), ([b"1", b"2", b"3"], True), ([b"1", b"2"], False)])
+def test_a_large_answer_has_its_room_until_it_is_sent_or_not_taken(room: Room, parts: list[bytes], takes: bool):
+    async def receive() -> Any:
+        await asyncio.Event().wait()
+
+    async def send(message: Any) -> None:
+        if message.get("body"):
+            with pytest.raises(QueryError, match="ask again later, or for less"):
+                room.take(4)
+            if not takes:
+                await asyncio.Event().wait()
+
+    async def serve() -> None:
+        response = await in_room(7 - min(2, len(parts)), lambda: answered(iter(parts), "text/plain"))
         assert isinstance(response, Large)
-
-        async def receive() -> Any:
-            await asyncio.Event().wait()
-
-        async def send(message: Any) -> None:
-            if message.get("body"):
-                with pytest.raises(QueryError, match="ask again later, or for less"):
-                    room.take(4)
-                if not takes:
-                    await asyncio.Event().wait()
-
         await response({"type": "http", "method": "GET", "headers": []}, receive, send)
         room.take(10)()
 
-    for parts, takes in (([b"1"], True), ([b"1", b"2", b"3"], True), ([b"1", b"2"], False)):
-        asyncio.run(serve(parts, takes=takes))
+    asyncio.run(serve())
+
+
+def test_an_answer_that_fails_or_is_small_leaves_its_room_and_one_that_is_too_large_takes_all(room: Room):
+    async def failing() -> Response:
+        raise QueryError("internal", "no answer")
+
+    async def serve() -> None:
+        with pytest.raises(QueryError, match="no answer"):
+            await in_room(7, failing)
+        await in_room(7, lambda: answered(iter([b""]), "text/plain"))
+        done = room.take(10**9)
+        with pytest.raises(QueryError, match="ask again later"):
+            await in_room(1, failing)
+        done()
+        room.take(10)()
+
+    asyncio.run(serve())
+
+
+def test_a_column_is_its_arrays_one_after_the_other():
+    arrays = [np.zeros(0), np.arange(3.0), np.array([np.nan]), np.zeros((0,))]
+    assert json.loads(b"".join(pieces({"x": Column(iter(arrays)), "y": 1}))) == {"x": [0.0, 1.0, 2.0, None], "y": 1}
 
 
 def test_the_newest_values_are_kept_that_have_room_together():

@@ -1,4 +1,4 @@
-"""A whole agent on synthetic readings: `python -m lab.speed.agent SECONDS` prints its share of a core and memory.
+"""A whole agent on synthetic readings: `python -m lab.agent SECONDS` prints its share of a core and memory.
 
 Imports an agent only.
 """
