@@ -10,7 +10,7 @@ from mapserver.roads.fuel import BURNED_SHARE, ROTATING, Litres, litres_of
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.loss import losses
 from mapserver.roads.tally import Tally
-from protocol.arrays import Table
+from protocol.arrays import Floats, Table
 from protocol.units import DIESEL_J_PER_L, GRAVITY_MPS2
 from tests.unit.mapserver.roads.drives import STEP_M, along, passes, roads
 
@@ -29,6 +29,13 @@ def driven(*, slope: float = 0.0, back: bool = False, accel_mps2: float = 0.0, f
     force = rows["mass_kg"] * (GRAVITY_MPS2 * (rows["c_rr"] + rise) + ROTATING * accel_mps2)
     hours = STEP_M / rows["speed_mps"] / 3600
     rows["fuel_l"] = np.maximum(PER_J * force * STEP_M + PER_H * hours, 0.0) if fuel else np.nan
+    return rows
+
+
+def burning(rows: Table, per_hour: float, accel_mps2: Floats | float = 0.0) -> Table:
+    """The same drive with fuel by work and by time."""
+    force = rows["mass_kg"] * (GRAVITY_MPS2 * rows["c_rr"] + ROTATING * accel_mps2)
+    rows["fuel_l"] = np.maximum(PER_J * force * STEP_M + per_hour * STEP_M / rows["speed_mps"] / 3600, 0.0)
     return rows
 
 
@@ -56,6 +63,31 @@ def test_what_follows_resistance_slope_and_speed_is_predicted_as_burned(slope: f
     assert (fuel.low[known] <= fuel.predicted[known]).all()
     assert (fuel.high[known] >= fuel.predicted[known]).all()
     assert fuel.burned_std == pytest.approx(BURNED_SHARE * fuel.burned)
+
+
+@pytest.mark.parametrize(("begin_m", "way_m"), [(95.0, 60.0), (105.0, 50.0), (120.0, 40.0)])
+def test_a_machine_that_speeds_up_near_the_end_of_a_segment_is_predicted_as_burned(
+    begin_m: float, way_m: float
+) -> None:
+    rows = passes(LINE, 6, 0.02)
+    run_m = np.clip(rows["x_m"] - begin_m, 0.0, way_m)
+    rows["speed_mps"] = np.sqrt(9.0 + 2 * 0.3 * run_m)
+    fuel = litres(burning(rows, PER_H, np.where((run_m > 0) & (run_m < way_m), 0.3, 0.0)))
+    assert fuel
+    assert fuel.burned.max() > 2 * fuel.burned.min()
+    assert fuel.predicted == pytest.approx(fuel.burned, rel=0.01)
+
+
+def test_a_slow_loader_is_predicted_as_burned_beside_trucks_whose_engines_lose_more() -> None:
+    """Four litres an hour at 2.5 m/s, eight at 8 m/s, on roads apart."""
+    fleet = []
+    for beside_m, mass_kg, speed_mps, per_hour in ((0.0, 40_000.0, 8.0, 8.0), (80.0, 17_000.0, 2.5, 4.0)):
+        rows = passes(LINE + np.array([0.0, beside_m]), 6, mass_kg=mass_kg)
+        rows["c_rr"], rows["speed_mps"] = np.where(rows["x_m"] < 160, 0.02, 0.06), speed_mps
+        fleet.append(burning(rows, per_hour))
+    fuel = litres(*fleet)
+    assert fuel
+    assert fuel.predicted == pytest.approx(fuel.burned, rel=0.02)
 
 
 def test_ground_that_the_map_has_wrong_stands_out() -> None:
