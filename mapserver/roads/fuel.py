@@ -31,7 +31,7 @@ BURNED_SHARE = 0.03  # relative standard deviation of an engine controller's fue
 LEAST_M = 100.0  # metres with known fuel that a fit needs
 JOULES = 1e6  # joules per unit of work, to balance the fit
 LEAST_L = 0.001  # litres; a lower bound for weights, a second of idling
-ROUNDS = 4  # iterations of the fit, which settles after two
+ROUNDS = 10  # upper bound of the fit's iterations, which mostly settle after three
 
 
 class Litres(NamedTuple):
@@ -85,7 +85,9 @@ def _price(uses: list[Floats], burned: Floats, ends: Ints) -> Floats:
     for _ in range(ROUNDS):
         columns = [by_segment(np.where(active, use, 0.0), ends).ravel() for use in uses]
         price, _ = nnls(np.stack(columns, axis=1) * weights[:, None], litres * weights)
-        active = _spent(price, uses) > 0
+        before, active = active, _spent(price, uses) > 0
+        if (before == active).all():
+            break
     return np.asarray(price, np.float64)
 
 
