@@ -65,14 +65,14 @@ def test_what_follows_resistance_slope_and_speed_is_predicted_as_burned(slope: f
     assert fuel.burned_std == pytest.approx(BURNED_SHARE * fuel.burned)
 
 
-@pytest.mark.parametrize(("begin_m", "way_m"), [(95.0, 60.0), (105.0, 50.0), (120.0, 40.0)])
+@pytest.mark.parametrize(("begin_m", "length_m"), [(95.0, 60.0), (105.0, 50.0), (120.0, 40.0)])
 def test_a_machine_that_speeds_up_near_the_end_of_a_segment_is_predicted_as_burned(
-    begin_m: float, way_m: float
+    begin_m: float, length_m: float
 ) -> None:
     rows = passes(LINE, 6, 0.02)
-    run_m = np.clip(rows["x_m"] - begin_m, 0.0, way_m)
+    run_m = np.clip(rows["x_m"] - begin_m, 0.0, length_m)
     rows["speed_mps"] = np.sqrt(9.0 + 2 * 0.3 * run_m)
-    fuel = litres(burning(rows, PER_H, np.where((run_m > 0) & (run_m < way_m), 0.3, 0.0)))
+    fuel = litres(burning(rows, PER_H, np.where((run_m > 0) & (run_m < length_m), 0.3, 0.0)))
     assert fuel
     assert fuel.burned.max() > 2 * fuel.burned.min()
     assert fuel.predicted == pytest.approx(fuel.burned, rel=0.01)
