@@ -81,7 +81,7 @@ def _agent_link(folder: Path, seconds: float) -> Figures:
     """An agent replaying a simulated drive, with subscribers to pose and health, which are else not sent."""
     log, store, config = folder / "log", folder / "store", load_site(SITE_FILE)
     store.mkdir()
-    words = ("--record", log, "--machines", 1, "--seconds", SPEED * seconds + 1.5 * LAG_S, "--speed", 0)
+    words = ("--record", log, "--machines", 1, "--seconds", SPEED * seconds + 1.5 * LAG_S, "--speed", 0, "--json")
     in_child("sitegrid.cli", "sim", *map(str, words))
     with ExitStack() as opened:
         site = opened.enter_context(Site(store, config))

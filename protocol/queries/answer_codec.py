@@ -16,6 +16,7 @@ from protocol.arrays import Floats, Floats32
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.queries import answers
 from protocol.site.geometry import MAX_CELLS
+from protocol.site.site_config import LEAST_CELL_M
 from protocol.wire.fields import MAX_SMALL_BYTES, check_plain, pack, take, take_store, unpack
 
 MAX_REPLY_BYTES = 2**23  # a piece has 0.8 MB, 2000 spans 1 MB
@@ -93,7 +94,7 @@ def decode_region(data: bytes) -> answers.Region:
     """Undo `encode_region`."""
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
-    if not (0 < cell_m <= MAX_CELL_M and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
+    if not (LEAST_CELL_M <= cell_m <= MAX_CELL_M and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{columns} x {rows} cells of {cell_m} m", field="columns, rows")
     if not (tables := take(table, "layers", dict)):  # their size proves the number of cells
         raise MessageError(Refusal.MISSING_FIELD, "empty", field="layers")

@@ -17,6 +17,7 @@ from protocol.site.geometry import GridGeometry
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 MAX_EXTENT_M = 100_000.0  # of any site
+LEAST_CELL_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,8 @@ class SiteConfig:
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
         if not (-80 <= self.origin_lat_deg <= 84 and -180 <= self.origin_lon_deg <= 180):
             raise ValueError("origin_lat_deg, origin_lon_deg: not a place on Earth between 80 S and 84 N")
-        if not 0.05 <= self.cell_m <= 100:
-            raise ValueError(f"cell_m: {self.cell_m} is not between 0.05 and 100")
+        if not LEAST_CELL_M <= self.cell_m <= 100:
+            raise ValueError(f"cell_m: {self.cell_m} is not between {LEAST_CELL_M} and 100")
         if not 10 <= self.extent_m <= MAX_EXTENT_M:
             raise ValueError(f"extent_m: {self.extent_m} is not between 10 and {MAX_EXTENT_M:g}")
         if self.clock not in ("data", "wall"):
