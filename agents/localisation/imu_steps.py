@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.dead_reckoning import (
+    PAUSE_NS,
     SILENT_NS,
     DeadReckonedPose,
     DeadReckoning,
@@ -34,6 +35,7 @@ Sensed = tuple[Reading, SensorConfig]
 PLACES = (Gps, GpsVelocity)
 NOTHING = (0.0,) * 7  # count and sums
 MIN_NORM = 0.5  # an unsettled reference sends a zero quaternion
+JOINT_RATE_S = 1.0  # time constant of a slow joint rate: 0.06 deg/s of noise where the angle has 0.2 degrees at 20 Hz
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,8 @@ class FilterStep:
 
     reckoned: dead-reckoned pose at its end. attitudes: last usable one per reference. wheels: speed at its end, over
     ground while silent. rolled: wheels were read and show a speed. traction: drive force over weight; still_s: time
-    without travel. turn: without IMU. silent: wheels are missing or long silent.
+    without travel. turn: without IMU. silent: wheels are missing or long silent. joint_radps: articulation rate,
+    low-passed, 0 if unknown.
     """
 
     stamp_ns: int
@@ -75,6 +78,7 @@ class FilterStep:
     still_s: float
     turn: Turn | None = None
     silent: bool = False
+    joint_radps: float = 0.0
 
 
 class StepGatherer:
@@ -95,6 +99,7 @@ class StepGatherer:
         self._begin_ns = 0
         self._sensed_ns = 0
         self._joint = WheelTracker()  # low-passed articulation angle
+        self._slow_joint, self._joint_ns = WheelTracker(JOINT_RATE_S), 0
         self._rolled = False
 
     def gather(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> FilterStep | None:
@@ -120,6 +125,8 @@ class StepGatherer:
             self._add_imu(reading, sensor)
         elif isinstance(reading, Articulation):
             self._joint.update(reading.stamp_ns, reading.angle_rad)
+            self._slow_joint.update(reading.stamp_ns, reading.angle_rad)
+            self._joint_ns = reading.stamp_ns
         elif isinstance(reading, Attitude):
             self._add_attitude(reading, sensor)
         elif isinstance(reading, Steering) and sensor.name == self._turn_sensor:
@@ -182,7 +189,10 @@ class StepGatherer:
         rolled, self._rolled = self._rolled and wheels.is_known and not silent, False
         turn = self._turn(wheels) if self._turn_values else None
         reckoned, traction, still_s = dead_reckoning.pose, dead_reckoning.traction, dead_reckoning.still_s(stamp_ns)
-        return FilterStep(stamp_ns, reckoned, imu_means, attitudes, wheels, rolled, traction, still_s, turn, silent)
+        joint_radps = self._slow_joint.speed_mps if stamp_ns - self._joint_ns <= PAUSE_NS else 0.0
+        return FilterStep(
+            stamp_ns, reckoned, imu_means, attitudes, wheels, rolled, traction, still_s, turn, silent, joint_radps
+        )
 
     def _turn(self, wheels: WheelSpeed) -> Turn | None:
         """By this step's readings; steering needs a speed."""

@@ -228,13 +228,15 @@ def rotation(stamp_ns: int, sensor: str, rates_radps: Floats, R: Floats, gate: f
     return Measurement(sensor, stamp_ns, rates_radps, R, *_picked(RATE), gate_sigma=gate)
 
 
-def standstill(stamp_ns: int, tuning: LocalisationTuning = TUNING) -> Measurement:
-    """Zero velocity update, which shows gyro biases: 0 = (v, w).
+def standstill(stamp_ns: int, tuning: LocalisationTuning = TUNING, *, turns: bool = False) -> Measurement:
+    """Zero velocity update, which shows gyro biases: 0 = (v, w); turns: 0 = v alone.
 
-    Never relocks: an articulated machine turns its rear frame by steering, also at standstill.
+    Never relocks: an articulated machine turns its rear frame by steering, also at standstill, and a joint sensor may
+    be missing.
     """
-    R = np.diag([tuning.still_mps**2] * 3 + [(0.1 * tuning.rate_radps) ** 2] * 3)
-    return _nothing(STANDSTILL, stamp_ns, slice(VELOCITY.start, RATE.stop), R, tuning.gate_sigma)
+    R = np.diag([tuning.still_mps**2] * 3 + [(0.1 * tuning.rate_radps) ** 2] * 3 * (not turns))
+    states = VELOCITY if turns else slice(VELOCITY.start, RATE.stop)
+    return _nothing(STANDSTILL, stamp_ns, states, R, tuning.gate_sigma)
 
 
 def _nothing(

@@ -111,8 +111,9 @@ class MotionSensors:
 
         considers: states that the speed leaves unchanged; a standstill updates them.
         """
+        folds = abs(step.joint_radps) > self._tuning.joint_radps  # at standstill the joint turns both frames
         if step.silent:
-            still = [measurements.rest(step.stamp_ns, self._tuning)] if step.still_s >= REST_S else []
+            still = [measurements.rest(step.stamp_ns, self._tuning)] if step.still_s >= REST_S and not folds else []
             return [measurements.sides(step.stamp_ns, considers, self._tuning), *still]
         if not step.rolled or not self._wheels:
             return []
@@ -130,7 +131,7 @@ class MotionSensors:
         rolled = measurements.wheels(step.stamp_ns, "wheels", z, R, scale, gate, offset_m, considers)
         if step.still_s < STANDSTILL_S:
             return [rolled]
-        return [rolled, measurements.standstill(step.stamp_ns, self._tuning)]
+        return [rolled, measurements.standstill(step.stamp_ns, self._tuning, turns=folds)]
 
     def _doubt_load(self, still_s: float) -> None:
         if still_s >= LOADING_S:

@@ -42,6 +42,7 @@ class LocalisationTuning:
     speed_mps: float = 0.04  # of wheels
     side_mps: float = 0.04  # sideways
     still_mps: float = 0.005  # at rest
+    joint_radps: float = 0.0035  # joint rate that turns a standing machine: three standard deviations of its noise
     rolling_s: float = 0.5  # time constant of rolling resistance
 
     # Gates, in standard deviations.

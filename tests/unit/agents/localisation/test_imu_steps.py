@@ -11,7 +11,7 @@ from agents.localisation.filters.motion import map_from_base
 from agents.localisation.filters.state import YAW_RATE, Layout
 from agents.localisation.headings import UNKNOWN_STD, rpy_of_base
 from agents.localisation.imu_steps import FilterStep, ImuMean, StepGatherer, Turn
-from agents.localisation.motion_sensors import STANDSTILL_S, MotionSensors
+from agents.localisation.motion_sensors import REST_S, STANDSTILL_S, MotionSensors
 from agents.localisation.tuning import TUNING
 from agents.stream_order import by_stamp
 from protocol.arrays import Floats
@@ -236,6 +236,27 @@ def test_a_machine_stands_once_its_wheels_do_not_turn_for_a_second() -> None:
     body = sensors(SensorConfig("wheels", "encoder"))
     named = [[m.sensor for m in body.wheels(replace(STEP, still_s=s))] for s in (STANDSTILL_S - 0.1, STANDSTILL_S)]
     assert named == [["wheels"], ["wheels", "standstill"]]
+
+
+@pytest.mark.parametrize(("joint", "shown"), [(0.9, 6), (1.1, 3), (-1.1, 3)])
+def test_while_the_joint_turns_a_standstill_shows_no_turn_rate(joint: float, shown: int) -> None:
+    body = sensors(SensorConfig("wheels", "encoder"))
+    _, still = body.wheels(replace(STEP, still_s=STANDSTILL_S, joint_radps=joint * TUNING.joint_radps))
+    assert (len(still.z), still.jacobian(np.zeros(17)).shape, still.R.shape) == (shown, (shown, 17), (shown, shown))
+    silent = replace(STEP, silent=True, still_s=REST_S, joint_radps=joint * TUNING.joint_radps)
+    assert ("standstill" in [m.sensor for m in body.wheels(silent)]) == (shown == 6)
+
+
+def test_joint_rate_is_that_of_a_noisy_angle_and_unknown_once_the_sensor_is_silent() -> None:
+    noise, rate = np.random.default_rng(1), 0.01
+    vehicle = with_imu(more=(SensorConfig("joint", "articulation"),))
+    turning: list[Reading] = [
+        Articulation("joint", START_NS + 50 * i * MS, 0.05 * i * rate + noise.normal(0, 0.0035)) for i in range(400)
+    ]
+    steps = gather(StepGatherer(vehicle, 0.05), vehicle, [*turning, *(imu(t, np.zeros(3)) for t in range(0, 25_000, 50))])
+    rates = np.array([step.joint_radps for step in steps])
+    assert np.abs(rates[100:398] - rate).max() < 0.0045  # four deviations of 0.06 deg/s
+    assert set(rates[-50:]) == {0.0}
 
 
 def test_a_turn_without_any_source_is_counted() -> None:

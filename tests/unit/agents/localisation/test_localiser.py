@@ -9,7 +9,7 @@ from agents.localisation.filters.state import BASE_STATES, YAW, Layout
 from agents.localisation.localiser import LocalisationConfig
 from protocol.arrays import Floats
 from protocol.machine.machine_config import SensorConfig
-from protocol.machine.readings import Gps, Imu
+from protocol.machine.readings import Articulation, Gps, Imu, Reading
 from protocol.site.site_config import Projection
 from tests.unit.agents.drives import (
     S_BEND,
@@ -82,6 +82,31 @@ def test_turning_on_the_spot_is_no_gyro_bias() -> None:
     assert located.counters["standstill_relocked"] == 0
     assert abs(state(located)[GYRO_BIAS]) < 1e-3
     assert made.turned_rad(located.belief) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("joint_radps", "bias_radps", "off_rad"), [(0.0094, 0.0, 0.0), (0.0, 0.0033, 0.12)])
+def test_slow_turn_at_rest_is_no_gyro_bias_if_the_joint_shows_it(
+    joint_radps: float, bias_radps: float, off_rad: float
+) -> None:
+    """The rear frame turns by 0.27 deg/s for 15 s, below the gate of a standstill; the joint twice as fast."""
+    vehicle = replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("joint", "articulation")))
+    made = drive([*S_BEND, Leg(4, -0.5, 0.0047), Leg(15, 0.0, 0.0047), Leg(5)], vehicle, without=("torque",))
+    noise = np.random.default_rng(3)
+    bent = [
+        replace(r, angle_rad=joint_radps * seconds_between(r, 30.0, 49.0) + noise.normal(0, 0.0035))
+        if isinstance(r, Articulation)
+        else r
+        for r in thinned(made.readings)
+    ]
+    located = localiser(vehicle)
+    located.run(bent)
+    assert state(located)[GYRO_BIAS] == pytest.approx(bias_radps, abs=2e-4)
+    assert made.turned_rad(located.belief) == pytest.approx(off_rad, abs=0.01)
+
+
+def seconds_between(reading: Reading, from_s: float, to_s: float) -> float:
+    return min(max((reading.stamp_ns - START_NS) * 1e-9 - from_s, 0.0), to_s - from_s)
 
 
 @pytest.mark.slow
