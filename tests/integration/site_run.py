@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 from mapserver.config import ServerConfig
@@ -79,8 +80,10 @@ class SiteRun:
     def end_of_agents(self) -> dict[str, dict]:
         return {name: agent.expect("ended", PATIENCE_S)["ended"] for name, agent in self.agents.items()}
 
-    def delivered(self) -> dict[str, dict]:
-        """Final agent reports; everything is delivered."""
+    def delivered(self, progress: Callable[[], object] = lambda: None) -> dict[str, dict]:
+        """Final agent reports; everything is delivered. progress: as in `until`, of what agents have still to read."""
+        agents = self.agents.values()
+        until(lambda: all(agent.code is not None for agent in agents), "end of the agents", progress)
         reports = self.end_of_agents()
         assert all(report["delivered"] for report in reports.values())
         return reports

@@ -18,7 +18,8 @@ from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.patience import until
 
 pytestmark = [pytest.mark.processes, pytest.mark.nightly]
-DRIVEN = SimConfig(scenario="paper_site_driven", machines=4, seconds=0, speed=3, seed=3, world="fast")
+# Waits last as long as machines drive: an hour that no machine spends on lanes is a failure.
+DRIVEN = SimConfig(scenario="paper_site_driven", machines=4, seconds=3600, speed=3, seed=3, world="fast")
 
 
 class Driving(SiteRun):
@@ -28,15 +29,18 @@ class Driving(SiteRun):
         return super().start_sim("--scenario", self.sim.scenario, *options)
 
 
+@pytest.mark.timeout(3600)  # a busy host takes 20 minutes
 def test_machines_follow_the_lanes_that_they_drew_also_while_the_server_is_down(tmp_path: Path):
     with Forks(tmp_path) as children:
         run = Driving(tmp_path, children, free_endpoint(), DRIVEN)
         _, server, driving = run.start()
         with run.connect() as client:
+            heard: dict[str, int] = {}
             used: dict[str, int] = {}
 
             def note(sample: zenoh.Sample) -> None:
                 health = decode_health(sample.payload.to_bytes())
+                heard[health.machine] = health.stamp_ns
                 if (health.values["lanes"] or {}).get("used"):
                     used[health.machine] = health.stamp_ns
 
@@ -46,18 +50,19 @@ def test_machines_follow_the_lanes_that_they_drew_also_while_the_server_is_down(
                 until(
                     lambda: len(used) == 4 and all(used[m] > before.get(m, 0) + seconds * 1e9 for m in used),
                     "machines on lanes",
+                    progress=heard.copy,
                 )
 
             subscriber = client.session.declare_subscriber(keys.health_all(run.site), note)
             follow_for(0)
             assert client.ask(LanesQuery()).tiles
             kill(server)
-            follow_for(120)
+            follow_for(60)
             run.start_server()
             follow_for(10)
-            subscriber.undeclare()
             driving.send(signal.SIGTERM)
-            reports = run.delivered()
+            reports = run.delivered(progress=heard.copy)
+            subscriber.undeclare()
         assert all(report["lanes"]["squares"] > 20 for report in reports.values())
         assert all(report["lanes"]["counters"]["lanes_bytes"] < 40_000 for report in reports.values())
         assert run.server.stop() == 0

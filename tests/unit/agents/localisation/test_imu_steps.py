@@ -253,7 +253,9 @@ def test_joint_rate_is_that_of_a_noisy_angle_and_unknown_once_the_sensor_is_sile
     turning: list[Reading] = [
         Articulation("joint", START_NS + 50 * i * MS, 0.05 * i * rate + noise.normal(0, 0.0035)) for i in range(400)
     ]
-    steps = gather(StepGatherer(vehicle, 0.05), vehicle, [*turning, *(imu(t, np.zeros(3)) for t in range(0, 25_000, 50))])
+    steps = gather(
+        StepGatherer(vehicle, 0.05), vehicle, [*turning, *(imu(t, np.zeros(3)) for t in range(0, 25_000, 50))]
+    )
     rates = np.array([step.joint_radps for step in steps])
     assert np.abs(rates[100:398] - rate).max() < 0.0045  # four deviations of 0.06 deg/s
     assert set(rates[-50:]) == {0.0}
