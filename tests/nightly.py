@@ -88,6 +88,7 @@ PARTS = (
 WEEKLY = (
     Part("soak-hour", 3700, (("tests.soak", "--minutes", "3600"),)),
     Part("takeovers", 1500, (("tests.takeover", "--count", "200"),)),
+    Part("lanes", 1000, (("tests.lanes_hour",),)),
 )
 
 
