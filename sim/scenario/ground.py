@@ -14,7 +14,11 @@ from sim.terrain.terrain import SOILS, Terrain
 FILLET_M = 2.0  # rounding length at a ramp's foot and crown
 ROUGHNESS_LENGTH_M = 1.2
 ROUGHNESS_STREAM = 2**32 - 1  # apart from machines, numbered from 0
+UNDULATION_STREAM = 2**32 - 2
 MAX_NODES = 20_000_000
+# Undulation as ISO 8608 classifies roads: displacement density at N0 falls with the spatial frequency squared. Longer
+# waves are out of its scope, shorter ones are roughness.
+N0_PER_M, UNDULATION_PER_M = 0.1, (0.01, 0.1)
 
 Point = tuple[float, float]
 
@@ -57,7 +61,8 @@ class RampConfig:
 class GroundConfig:
     """Rectangle north-east of the origin of `map`. soil: outside zones; later zones cover earlier ones.
 
-    cell_m: of heights and zones. roughness_m: standard deviation.
+    cell_m: of heights and zones. roughness_m: standard deviation. undulation_cm3: displacement density at 0.1 cycles/m
+    of waves of 10 to 100 m, ISO 8608 (1024: middle of class D), the same for each seed.
     """
 
     width_m: float
@@ -67,12 +72,14 @@ class GroundConfig:
     roughness_m: float = 0.01
     zone: tuple[ZoneConfig, ...] = ()
     ramp: tuple[RampConfig, ...] = ()
+    undulation_cm3: float = 0.0
 
     def __post_init__(self) -> None:
         soil_index(self.soil)
         require_between(self, 10, 1e5, "width_m", "depth_m")
         require_between(self, 0.05, 5, "cell_m")
         require_between(self, 0, 0.1, "roughness_m")
+        require_between(self, 0, 16384, "undulation_cm3")
         if self.width_m * self.depth_m / self.cell_m**2 > MAX_NODES:
             raise ValueError(f"cell_m: {self.cell_m:g} m is too fine for so large a site, over {MAX_NODES} nodes")
 
@@ -96,6 +103,8 @@ def build_terrain(ground: GroundConfig, seed: int) -> Terrain:
     heights = _profile(ground, rows, columns)
     if ground.roughness_m:
         heights += _unevenness(ground, heights.shape, seed)
+    if ground.undulation_cm3:
+        heights += _undulation(ground, heights.shape)
     zones = np.full((rows, columns), soil_index(ground.soil), np.int64)
     terrain = Terrain(heights, ground.cell_m, zones, ground.cell_m)
     for zone in ground.zone:
@@ -139,3 +148,19 @@ def _unevenness(ground: GroundConfig, shape: tuple[int, ...], seed: int) -> Floa
     uneven = np.asarray(cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), blur), np.float64)
     rough: Floats = uneven * (ground.roughness_m / uneven.std())
     return rough
+
+
+def _undulation(ground: GroundConfig, shape: tuple[int, ...]) -> Floats:
+    """Isotropic waves whose profile along any line has the one-sided density G(n) = G0 (n / N0)^-2 [m3].
+
+    A plane density C / k^3 [m4], k = |(kx, ky)|, integrates over ky to 2 C / kx^2, and C = G0 N0^2 / 4.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(UNDULATION_STREAM,)))
+    along, across = np.fft.rfftfreq(shape[1], ground.cell_m), np.fft.fftfreq(shape[0], ground.cell_m)
+    k = np.hypot(along, across[:, None])
+    is_long = (k >= UNDULATION_PER_M[0]) & (k <= UNDULATION_PER_M[1])
+    density_m4 = np.zeros_like(k)
+    density_m4[is_long] = ground.undulation_cm3 * 1e-6 * N0_PER_M**2 / 4 / k[is_long] ** 3
+    waves = np.fft.rfft2(rng.standard_normal(shape)) * np.sqrt(density_m4) / ground.cell_m
+    heights: Floats = np.fft.irfft2(waves, shape)
+    return heights

@@ -54,6 +54,18 @@ def test_roughness_has_the_deviation_asked_for_and_follows_the_seed() -> None:
     assert not np.array_equal(rough[0], rough[2])
 
 
+def test_undulation_has_the_density_of_its_road_class_in_any_direction_whatever_the_seed() -> None:
+    ground = GroundConfig(400, 400, "gravel", 0.5, 0.0, undulation_cm3=1024)
+    waves = build_terrain(ground, 1).heights_m
+    assert np.array_equal(waves, build_terrain(ground, 2).heights_m)
+    for lines in (waves, waves.T):
+        count = lines.shape[1]
+        n = np.fft.rfftfreq(count, 0.5)
+        density_m3 = (np.abs(np.fft.rfft(lines)) ** 2).mean(axis=0) * 2 * 0.5 / count
+        middle = (n > 0.015) & (n < 0.06)  # beside the limits waves across the line are missing
+        assert (density_m3 * (n / 0.1) ** 2)[middle].mean() == pytest.approx(1024e-6, rel=0.2)
+
+
 def test_later_zones_cover_earlier_ones_and_paving_covers_all() -> None:
     square = ((2.0, 2.0), (8.0, 2.0), (8.0, 8.0), (2.0, 8.0))
     ground = GroundConfig(10, 10, "sand", 0.5, 0.0, (ZoneConfig("gravel", square), ZoneConfig("wet dirt", square)))
