@@ -42,6 +42,7 @@ from sitegrid.web.values import Parameters, bad
 
 MAX_CELLS = {"json": 250_000, "npz": 4_000_000}  # of a region; 2 MB of text per layer
 MAX_VALUES = 16_000_000  # cells times layers: 64 MB
+ZONES_BYTES = 32  # per known cell: its tile, and a picture with its outlines where the ground has no pattern
 TILES_AT_ONCE = 256  # of lanes, as columns: 2 MB
 AGES = ("age_s", "changed_s")  # layers that depend on the site's now
 
@@ -180,16 +181,11 @@ def _strokes(answer: LanesAnswer, name: str) -> Iterator[Floats]:
 async def tiles(feed: SiteFeed, query: TilesQuery, _: Parameters) -> Response:
     """Map tiles of 8-bit layers, as for the live page: all, since a version, or as of a time."""
     making = partial(feed.answer_to, query) if query.as_of_ns is None else partial(feed.tiles_as_of, query.as_of_ns)
-    return await in_room(await _tiles_bytes(feed), lambda: _framed(making))
+    return await in_room(len(PLANES) * (await feed.info()).cells, lambda: _framed(making))
 
 
 async def _framed(asking: Callable[[], Awaitable[TilesAnswer]]) -> Response:
     return await answered(framed(await asking()), BINARY[0])
-
-
-async def _tiles_bytes(feed: SiteFeed) -> int:
-    """Upper bound of all tiles."""
-    return len(PLANES) * (await feed.info()).cells
 
 
 async def zone_features(feed: SiteFeed, query: TilesQuery, more: Parameters) -> Response:
@@ -199,7 +195,7 @@ async def zone_features(feed: SiteFeed, query: TilesQuery, more: Parameters) -> 
     async def making() -> Response:
         return await as_features(feed, more, "zones", zones(await feed.answer_to(query), boundaries))
 
-    return await in_room(await _tiles_bytes(feed), making)
+    return await in_room(ZONES_BYTES * (await feed.info()).cells, making)
 
 
 async def change_features(feed: SiteFeed, query: ChangesQuery, more: Parameters) -> Response:
