@@ -73,17 +73,18 @@ class Display:
 
 @contextmanager
 def compilation_reported() -> Iterator[None]:
-    """Print `{"compiling": n}`, the number of kernels so far, for the first and then every EVERY_S."""
+    """Print `{"compiling": n, "kernel": name}`, the number of kernels so far, for the first and then every EVERY_S."""
     from numba.core.event import Event, Listener, install_listener
 
     class Counter(Listener):
         count, next_s = 0, 0.0
 
-        def on_start(self, _: Event) -> None:
+        def on_start(self, event: Event) -> None:
             self.count += 1
             if time.monotonic() >= self.next_s:
                 self.next_s = time.monotonic() + EVERY_S
-                say({"compiling": self.count, **({"note": COMPILING} if self.count == 1 else {})})
+                line = {"compiling": self.count, "kernel": event.data["dispatcher"].py_func.__qualname__}
+                say(line | ({"note": COMPILING} if self.count == 1 else {}))
 
         def on_end(self, _: Event) -> None: ...
 

@@ -139,7 +139,7 @@ with compilation_reported():
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     command = [sys.executable, str(tmp_path / "kernel.py")]
     first, second = (subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2))
-    assert json.loads(first) == {"compiling": 1, "note": COMPILING}
+    assert json.loads(first) == {"compiling": 1, "kernel": "twice", "note": COMPILING}
     assert second == ""
 
 
