@@ -143,6 +143,21 @@ with compilation_reported():
     assert second == ""
 
 
+def test_a_kernel_that_compiles_for_long_is_reported_again(tmp_path):
+    code = """
+import numba
+from sitegrid.process import progress
+progress.EVERY_S = 0.001
+with progress.compilation_reported():
+    numba.njit(lambda x: 2 * x)(1)
+"""
+    (tmp_path / "kernel.py").write_text(code)
+    command = [sys.executable, str(tmp_path / "kernel.py")]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(said) > 1
+    assert {json.loads(line)["compiling"] for line in said} == {1}
+
+
 def test_plain_lines_come_now_and_then_only(monkeypatch, capsys):
     now = iter([100.0, 100.0, 101.0, 106.0, 106.0])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
