@@ -23,11 +23,14 @@ RUN find . -type d -name tests -prune -exec rm -r {} + \
     && /venv/bin/python -c "import agents.agent, agents.drivers.zenoh, sitegrid.command_line"
 
 FROM build AS build-server
-RUN $INSTALL ".[postgres,security,server,web]"
+RUN $INSTALL ".[postgres,security,server,web]" pyogrio shapely
 WORKDIR /venv/lib/python3.11/site-packages
 RUN find . -type d -name tests -prune -exec rm -r {} + \
     && rm -r pyarrow/include pyarrow/*flight* pyarrow/_substrait* pyarrow/*_s3* \
-    scipy/integrate scipy/interpolate scipy/io scipy/signal scipy/stats
+    pyarrow/libarrow_python.so pyarrow/libarrow_python.so.*.*.* \
+    scipy/integrate scipy/interpolate scipy/io scipy/signal scipy/stats \
+    && find mapserver -name "*.py" -exec touch --date=2026-01-01 {} +
+# Numba compares the time of a kernel's source, and a registry keeps whole seconds alone.
 # Kernels for any processor of this kind: one that differs from the builder's would compile them anew.
 ENV NUMBA_CPU_NAME=generic
 RUN NUMBA_CACHE_DIR=/kernels /venv/bin/python -c \

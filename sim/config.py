@@ -117,7 +117,7 @@ def write_configs(config: SimConfig, folder: Path, ports: Path | None = None) ->
 def _world(asked: str | None, scenario: Scenario) -> str:
     if asked or scenario.world == "fast" or find_spec("pybullet"):
         return asked or scenario.world
-    log.warning("the fast world takes its place problem='PyBullet has wheels for Python 3.11 alone'")
+    log.warning("the fast world takes the place of PyBullet, which has wheels for Python 3.11 on x86-64 alone")
     return "fast"
 
 

@@ -16,6 +16,7 @@ from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from importlib import import_module
+from platform import machine
 from types import ModuleType
 from typing import NoReturn
 
@@ -119,8 +120,8 @@ def _listed(groups: Mapping[str, Sequence[str]], modules: Mapping[str, ModuleTyp
 def _extra_for(error: ModuleNotFoundError, extra: str, beside: Mapping[str, str] = BESIDE) -> str:
     """Advice to install an extra; empty if the module is ours, or in no extra."""
     module = str(error.name).partition(".")[0]
-    if module == "pybullet" and sys.version_info >= (3, 12):
-        return "PyBullet has wheels for Python 3.11 alone: run this with that, or in the fast world (--world fast)"
+    if module == "pybullet" and (sys.version_info >= (3, 12) or machine() != "x86_64"):
+        return "PyBullet has wheels for Python 3.11 on x86-64 alone: run this there, or with --world fast"
     extras = ",".join(dict.fromkeys(filter(None, (extra, beside.get(module)))))
     if not extras or module in OURS or module in sys.stdlib_module_names:
         return ""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from mapserver.roads.cutting import LATTICE_M
@@ -96,7 +97,7 @@ def between(table: Table, first: int, end: int) -> Table:
     return table[slice(*bounds)]
 
 
-@numba.njit(cache=True, nogil=True)
+@register_jitable  # numpy outside of kernels: a column of one row has another layout, which would be compiled too
 def slot(keys: Any) -> Any:
     """Number of the time span since 1970."""
     return keys >> _SLOT_SHIFT

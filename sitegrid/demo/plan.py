@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from argparse import Namespace
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,7 @@ def make_plan(arguments: Namespace) -> DemoPlan:
     except ValueError as error:
         raise ConfigError("sitegrid demo", str(error)) from None
     scenario = resolve(config)
+    config = replace(config, world=scenario.world)  # without PyBullet another one than the scenario's; said once
     if arguments.data and not arguments.log:
         raise ConfigError("--data", "is the folder of a log; name the log with --log")
     log = open_log(arguments.log, arguments.data) if arguments.log else None

@@ -73,21 +73,35 @@ class Display:
 
 @contextmanager
 def compilation_reported() -> Iterator[None]:
-    """Print `{"compiling": n}`, the number of kernels so far, for the first and then every EVERY_S."""
+    """Print `{"compiling": n, "kernel": name}` at the first kernel, then every EVERY_S while any compiles.
+
+    n: kernels so far. So one that takes minutes on a busy host does not look like a hung process.
+    """
     from numba.core.event import Event, Listener, install_listener
 
-    class Counter(Listener):
-        count, next_s = 0, 0.0
+    class Reporter(Listener):
+        count, thread = 0, threading.Thread()
+        open: tuple[str, ...] = ()  # kernels that compile, the innermost last
 
-        def on_start(self, _: Event) -> None:
+        def on_start(self, event: Event) -> None:
             self.count += 1
-            if time.monotonic() >= self.next_s:
-                self.next_s = time.monotonic() + EVERY_S
-                say({"compiling": self.count, **({"note": COMPILING} if self.count == 1 else {})})
+            self.open = (*self.open, event.data["dispatcher"].py_func.__qualname__)
+            if not self.thread.is_alive():
+                more = {"note": COMPILING} if self.count == 1 else {}
+                say({"compiling": self.count, "kernel": self.open[-1], **more})
+                self.thread = threading.Thread(target=self.repeat, name="kernels reported", daemon=True)
+                self.thread.start()
 
-        def on_end(self, _: Event) -> None: ...
+        def on_end(self, _: Event) -> None:
+            self.open = self.open[:-1]
 
-    with install_listener("numba:compile", Counter()):
+        def repeat(self) -> None:
+            time.sleep(EVERY_S)
+            while kernels := self.open:
+                say({"compiling": self.count, "kernel": kernels[-1]})
+                time.sleep(EVERY_S)
+
+    with install_listener("numba:compile", Reporter()):
         yield
 
 

@@ -16,7 +16,6 @@ from protocol.queries.parameters import ValueForm, name_of, number, text_of
 from protocol.queries.request import Fresh, MapQuery, Parameter, parameters_of
 from protocol.queries.requests import parse_query
 from sitegrid.features.feature import Collection, geojson
-from sitegrid.features.gdal import flat_geobuf
 from sitegrid.web import values
 from sitegrid.web.encoding import answered, as_json
 from sitegrid.web.site import SiteFeed
@@ -112,6 +111,11 @@ async def as_features(feed: SiteFeed, more: Parameters, name: str, collection: C
         raise values.bad(Refusal.OUT_OF_RANGE, f"parameter `{FEATURE_FORMAT.name}`: {FEATURE_FORMAT.help}")
     projection = await feed.projection()
     if kind == "fgb":
+        try:
+            from sitegrid.features.gdal import flat_geobuf  # 110 MB, which the page does not need
+        except ModuleNotFoundError:
+            problem = f"parameter `{FEATURE_FORMAT.name}`: fgb needs pip install '.[export]' where the web server runs"
+            raise values.bad(Refusal.OUT_OF_RANGE, f"{problem}; geojson needs nothing") from None
         return await answered(flat_geobuf(collection, projection, name), FEATURE_MEDIA[kind])
     return await as_json(geojson(collection, projection), FEATURE_MEDIA[kind])
 

@@ -7,15 +7,19 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import distributions
+from itertools import chain
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from tests.paths import ROOT
 from tests.release.stores import version
 
 pytestmark = [pytest.mark.processes, pytest.mark.nightly]
+GLIBC = (28, 27, 26, 24, 17, 12, 5)  # 2.28 and what runs with it
 PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid")
 
 
@@ -56,6 +60,21 @@ def test_a_wheel_of_the_source_distribution_runs_a_demo_far_from_the_checkout(wh
     printed = run(sys.executable, "-m", "sitegrid", *words, folder=tmp_path, PYTHONPATH=str(site))
     assert json.loads(printed.splitlines()[-1])
     assert [*(tmp_path / "out").glob("*.png")]
+
+
+@pytest.mark.parametrize(("python", "machine"), [("3.12", "x86_64"), *((f"3.{n}", "aarch64") for n in (11, 12, 13))])
+def test_the_demo_has_a_wheel_of_every_pin_for(python: str, machine: str, tmp_path: Path) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    texts = [project["dependencies"], *(extras[name] for name in ("agent", "archive", "server", "sim", "web"))]
+    target = {"python_version": python, "platform_machine": machine}
+    wanted = [one for text in chain(*texts) if not (one := Requirement(text)).name.startswith("sitegrid")]
+    names = {str(one).partition(";")[0] for one in wanted if not one.marker or one.marker.evaluate(target)}
+    assert not any(name.startswith("pybullet") for name in names)
+    tags = [word for minor in GLIBC for word in ("--platform", f"manylinux_2_{minor}_{machine}")]
+    words = ("--dry-run", "--ignore-installed", "--only-binary", ":all:", "--python-version", python, *tags)
+    pins = ("--constraint", ROOT / "constraints.txt", "--target", tmp_path)
+    run(sys.executable, "-m", "pip", "install", "--quiet", *words, *pins, *sorted(names), folder=tmp_path)
 
 
 def test_a_bill_of_materials_names_all_that_is_installed_with_its_licence() -> None:

@@ -40,6 +40,7 @@ with tempfile.TemporaryDirectory() as folder, closing(open_writer(Path(folder)))
             rows["applied_zero"] = 0.001
             send(writer, [incoming(rows, seq, machine)])
             seq += len(rows)
+    send(writer, [incoming(rows[:1], 1, "c")])  # a column of one row is contiguous, which others are not
     answers, place = answers_of(writer), (50.0, 10.0)
     answered(answers, PointQuery.name, PointQuery(*place).parameters())
     late = sorted(set(ready()) - begun)

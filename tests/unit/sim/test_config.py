@@ -68,4 +68,4 @@ def test_without_pybullet_the_fast_world_takes_its_place_and_says_so(monkeypatch
     assert resolve(SimConfig("haul_road", world="pybullet")).world == "pybullet"  # fails later, in one line
     assert not caplog.records
     assert resolve(SimConfig("haul_road")).world == "fast"
-    assert "the fast world takes its place" in caplog.text
+    assert "the fast world takes the place of PyBullet" in caplog.text

@@ -139,8 +139,23 @@ with compilation_reported():
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     command = [sys.executable, str(tmp_path / "kernel.py")]
     first, second = (subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2))
-    assert json.loads(first) == {"compiling": 1, "note": COMPILING}
+    assert json.loads(first) == {"compiling": 1, "kernel": "twice", "note": COMPILING}
     assert second == ""
+
+
+def test_a_kernel_that_compiles_for_long_is_reported_again(tmp_path):
+    code = """
+import numba
+from sitegrid.process import progress
+progress.EVERY_S = 0.001
+with progress.compilation_reported():
+    numba.njit(lambda x: 2 * x)(1)
+"""
+    (tmp_path / "kernel.py").write_text(code)
+    command = [sys.executable, str(tmp_path / "kernel.py")]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(said) > 1
+    assert {json.loads(line)["compiling"] for line in said} == {1}
 
 
 def test_plain_lines_come_now_and_then_only(monkeypatch, capsys):
