@@ -2,7 +2,7 @@
 
 A block costs memory for the map's life. One sample of 80 bytes opens up to four: scattered, each costs 7 kB; on open
 ground each adds a page per bucket. Refused samples are not journalled, so the map stays a function of the journal.
-Credit is lost on restart: all machines are new then (docs/decisions/0011-credit-for-new-ground.md).
+Credit is lost on restart, but who is in the journal then is no newcomer (docs/decisions/0011-credit-for-new-ground.md).
 """
 
 from __future__ import annotations
@@ -57,10 +57,19 @@ class Account:
 class BlockCredit:
     """The accounts of all machines. opened: keys of open blocks.
 
-    most: limit of jumps and driven [blocks]. per_m, jumps_per_m: earned per metre.
+    most: limit of jumps and driven [blocks]. per_m, jumps_per_m: earned per metre. known: no newcomers, once each.
+    signed: names are not free, so newcomers have full credit.
     """
 
-    def __init__(self, cell_m: float, config: FoldConfig, opened: Iterable[Block]) -> None:
+    def __init__(
+        self,
+        cell_m: float,
+        config: FoldConfig,
+        opened: Iterable[Block],
+        known: Iterable[str] = (),
+        *,
+        signed: bool = False,
+    ) -> None:
         self.opened, self._accounts = {block_key(*block) for block in opened}, dict[str, Account]()
         self._limits, self._entered = (cell_m, STD_FLOOR_M**2, config.std_cap_m**2), np.empty((1, 2), np.int64)
         # New ground is met by a moving square, as wide as votes plus position errors on both sides; at 45 degrees it
@@ -73,6 +82,7 @@ class BlockCredit:
         self.most, self.jumps_per_m = float(JUMPS * blocks), blocks / JUMP_M
         self._bucket_ns, self._blocks = config.bucket_ns, blocks
         self._newcomers, self._newcomer_ns = 1.0, 0
+        self._known, self._signed = set(known), signed
 
     def spend(self, machine: str, rows: Table, trimmed: int = 0, now_ns: int = 0) -> None:
         """Open the blocks of a machine's new samples; trimmed: samples of the batch before them.
@@ -124,10 +134,9 @@ class BlockCredit:
         """The machine's account, with what time has earned."""
         known = self._accounts.pop(machine, None)
         if known is None:
-            self._newcomers = min(1.0, self._newcomers + NEWCOMER * max(0, now_ns - self._newcomer_ns) / 60e9)
-            self._newcomer_ns = now_ns
-            credit = Credit(self.most * self._newcomers, 0.0, FIRST_PAGES * self._newcomers)
-            self._newcomers -= NEWCOMER * self._newcomers
+            share = 1.0 if self._signed or machine in self._known else self._newcomer_share(now_ns)
+            self._known.discard(machine)
+            credit = Credit(self.most * share, 0.0, FIRST_PAGES * share)
             if len(self._accounts) >= MOST_ACCOUNTS:
                 del self._accounts[next(iter(self._accounts))]
             known = Account(credit, now_ns)
@@ -135,6 +144,12 @@ class BlockCredit:
         credit = known.credit._replace(pages=min(known.credit.pages + stayed, PAGES))
         self._accounts[machine] = account = replace(known, credit=credit, seen_ns=max(now_ns, known.seen_ns))
         return account
+
+    def _newcomer_share(self, now_ns: int) -> float:
+        """Share of a full credit for the next newcomer."""
+        share = min(1.0, self._newcomers + NEWCOMER * max(0, now_ns - self._newcomer_ns) / 60e9)
+        self._newcomers, self._newcomer_ns = share - NEWCOMER * share, now_ns
+        return share
 
     def _earned(self, credit: Credit, driven_m: float) -> Credit:
         by_jumps = self.jumps_per_m * driven_m

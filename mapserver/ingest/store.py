@@ -273,7 +273,8 @@ class Store:
 
     def _new_credit(self) -> BlockCredit:
         """Accounts for the present map, without what a failed commit spent."""
-        return BlockCredit(self.site.cell_m, self.config.fold, self.grid.folded_since(-1)[0])
+        opened, signed = self.grid.folded_since(-1)[0], self._verify is not None
+        return BlockCredit(self.site.cell_m, self.config.fold, opened, self.journal.machines(), signed=signed)
 
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
         """Count a batch's final outcome."""

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -308,6 +309,20 @@ def test_memory_goes_with_what_was_driven(known: list[tuple[int, int]], every_s:
             taken_rows.append(rows[k : k + 1])
     bytes_of_pages = sum(len(record) for *_, record in folded(np.concatenate(taken_rows)).state().blocks)
     assert 10**5 < bytes_of_pages < (10**7 if names == 1 else 3 * 10**8)
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_a_fleet_of_any_size_goes_on_after_a_start_of_the_server(signed: bool):
+    """Only names that are free, and of no machine that the journal knows, share one credit."""
+    fleet = [f"machine-{k}" for k in range(2000)]
+    credit, taken_rows = BlockCredit(1.0, CONFIG, (), [] if signed else fleet, signed=signed), Counter[str]()
+    for number, machine in enumerate([*fleet, *(f"stranger-{k}" for k in range(2000))]):
+        with contextlib.suppress(MessageError):
+            credit.spend(machine, samples(1, x_m=100.0 * number), now_ns=1)
+            taken_rows[machine.partition("-")[0]] += 1
+    assert taken_rows["machine"] == 2000
+    assert (taken_rows["stranger"] == 2000) == signed
+    assert taken_rows["stranger"] > 100
 
 
 @pytest.mark.parametrize(
