@@ -136,10 +136,13 @@ def evidence_hash(snapshot: Path) -> str:
         return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-def write_store(folder: Path, site: SiteConfig, rows: int, tail_rows: int, in_row: int = BATCH) -> None:
+def write_store(
+    folder: Path, site: SiteConfig, rows: int, tail_rows: int, in_row: int = BATCH, known: Sequence[str] = ()
+) -> None:
     """Write a journal of `rows`, and a snapshot tail_rows before its end, if it is longer.
 
-    in_row: samples per row: BATCH, or A_SECOND for machines that are always connected.
+    in_row: samples per row: BATCH, or A_SECOND for machines that are always connected. known: further machines, of
+    which it has a sample each.
     """
     config = ServerConfig().fold
     journal, grid = JournalLocation(folder).open(site.name, site.frame), Grid(site.cell_m, config)
@@ -158,5 +161,7 @@ def write_store(folder: Path, site: SiteConfig, rows: int, tail_rows: int, in_ro
         if number % IN_ONE_COMMIT == 0:
             journal.commit()
             journal.begin()
+    for name in known:
+        journal.append(Admission(SampleBatch(name, 2, 1, batch[:1], site.frame), trimmed=0, lost=0), START_NS)
     journal.commit()
     journal.close()

@@ -46,10 +46,10 @@ def run(machines: int, seconds: float, hours: float) -> Iterator[Row]:
     from a real drive because synthetic samples compress better.
     """
     with tempfile.TemporaryDirectory() as path, Site(Path(path)) as site, ExitStack() as opened:
-        write_store(Path(path), SITE, samples_of(hours) // BATCH, tail_rows=0)
-        server = opened.enter_context(site.serving())
         links = [opened.enter_context(session(site.endpoint)) for _ in range(min(machines, SESSIONS))]
         senders = fleet(links, machines)
+        write_store(Path(path), SITE, samples_of(hours) // BATCH, 0, known=[one.name for one in senders])
+        server = opened.enter_context(site.serving())
         settle(server)
         for name, period_s in LOADS.items():
             yield from rows_of(name, _measured(server, site.router, senders, seconds, period_s))
