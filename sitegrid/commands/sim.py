@@ -75,7 +75,16 @@ def run(arguments: Namespace) -> int:
     settings = join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name)
     if arguments.ports:
         settings = dataclasses.replace(settings, wait_s=-1)  # receivers speak before anybody connects to a router
-    progress = (lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None
+    where = f"; receivers speak on {arguments.ports}/*" if arguments.ports else ""
+    beginning = iter([f"machines drive{where}"])
+
+    def progress(simulated_s: float) -> None:
+        if arguments.json:
+            say({"simulated_s": round(simulated_s, 1)})
+        else:
+            for line in beginning:  # at the first call alone
+                note(line)
+
     report = publish(config, settings, stop, on_progress=progress, truth_dir=arguments.truth, ports_dir=arguments.ports)
     true = f"; the truth is in {arguments.truth}" if arguments.truth else ""
     line = f"simulated {report.simulated_s:g} s of {report.machines} machines: {report.readings} readings{true}"

@@ -16,7 +16,7 @@ from typing import Any
 from sitegrid.process.lifetime import note, say
 
 EVERY_S = 5.0  # between two plain lines
-COMPILING = "first start: compiling kernels; it answers after the first ones, all take about a minute"
+COMPILING = "first start: kernels compile for about a minute"
 
 
 class Display:
@@ -45,7 +45,7 @@ class Display:
             self._bar.remove_task(self._task)
             self._task = self._bar.add_task(title, total=None, what=what)
         else:
-            note(f"{title} {what}".rstrip())
+            note(f"{title}, {what}" if what else title)
 
     def show(self, done_s: float, total_s: float, what: str) -> None:
         """Show how many simulated seconds are done, and what there is to say."""

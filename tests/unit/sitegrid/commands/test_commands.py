@@ -14,6 +14,7 @@ from protocol.errors import ConfigError
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import machine_toml
 from protocol.site.site_file import load_site
+from protocol.wire.session import free_endpoint
 from sim.config import resolve
 from sim.scenario.file import load_scenario
 from sim.truth import TruthMap
@@ -53,6 +54,16 @@ def test_sim_records_log_folders_and_truth(tmp_path: Path, capsys):
     assert len(list(open_log(logs / "loader-2").readings())) > 300
     assert TruthMap.load(truth / "truth_map.npz").c_rr.shape == (150, 200)
     assert not list(logs.rglob("*truth*"))
+
+
+@pytest.mark.slow
+def test_sim_says_once_that_machines_drive_and_where_receivers_speak(tmp_path: Path, capsys):
+    ports = tmp_path / "ports"
+    words = ["--ports", str(ports), "--world", "fast", "--machines", "1", "--seconds", "1.5"]
+    assert main(["sim", "--endpoint", free_endpoint(), *words]) == 0
+    begun, ended = capsys.readouterr().err.splitlines()
+    assert begun == f"machines drive; receivers speak on {ports}/*"
+    assert ended.startswith("simulated 1.5 s of 1 machines: ")
 
 
 def test_sim_writes_what_agents_need(tmp_path: Path):
