@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import sys
+import threading
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, LinkError
 from sitegrid.command_line import build_parser
 from sitegrid.demo.plan import DemoPlan, make_plan, start_sim
-from sitegrid.demo.run import stays
+from sitegrid.demo.run import _watch, stays
 from tests.paths import ROOT
 
 
@@ -39,6 +41,27 @@ def test_the_page_stays_on_a_terminal_or_where_it_is_asked_for(words, on_termina
     for is_terminal, expected in ((True, on_terminal), (False, elsewhere)):
         monkeypatch.setattr(sys.stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
         assert stays(arguments) == expected
+
+
+def test_a_server_too_busy_for_a_picture_does_not_end_the_demo(tmp_path: Path, monkeypatch):
+    asked: list[float] = []
+    sim = Mock(code=None, lines=Mock(return_value=[]))
+
+    def region(*_: object) -> None:
+        asked.append(clock[0])
+        sim.code = 0 if len(asked) == 2 else None
+        raise LinkError("tcp/127.0.0.1:1", "the map server did not answer in time")
+
+    def later() -> float:
+        clock[0] += 2.0
+        return clock[0]
+
+    clock = [0.0]
+    monkeypatch.setattr("sitegrid.demo.run.time.monotonic", later)
+    client, display = Mock(region=region), Mock()
+    stop = Mock(spec=threading.Event, wait=Mock(return_value=False))
+    _watch(plan_of(tmp_path), client, Mock(), (sim, {}), (stop, display))
+    assert len(asked) == 2
 
 
 def test_an_earlier_run_is_cleared_away(tmp_path: Path):
