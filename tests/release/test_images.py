@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,14 @@ from protocol.queries.roads import WorklistQuery
 from protocol.wire.session import free_endpoint
 from sitegrid import connect
 from tests.patience import PATIENCE_S, until
-from tests.release.images import BASE, Containers, Images
+from tests.release.images import BASE, NEEDS_TOOLS, Containers, Images
 from tests.release.stores import version
 
 pytestmark = [
     pytest.mark.processes,
     pytest.mark.nightly,
     pytest.mark.timeout(3600),
-    pytest.mark.skipif(not (shutil.which("buildah") and shutil.which("mmdebstrap")), reason="no buildah, mmdebstrap"),
+    NEEDS_TOOLS,
 ]
 MOST_MB = {"agent": 200, "server": 840, "sim": 700}  # above the base; lab/results/speed.md has the goals
 
@@ -40,14 +39,9 @@ class Built:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Built]:
-    folder = tmp_path_factory.mktemp("images")
-    images = Images(folder)
-    try:
+    with Images(tmp_path_factory.mktemp("images")) as images:
         images.have_base()
         yield Built(images, {target: images.build(target) for target in MOST_MB})
-    finally:  # a build that failed leaves its file system mounted, which no other test can remove
-        images.run("rm", "--all")
-        images.run("rmi", "--all", "--force")
 
 
 @pytest.mark.parametrize("target", MOST_MB)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,10 +17,18 @@ import pytest
 from packaging.requirements import Requirement
 
 from tests.paths import ROOT
+from tests.release.images import MOUNTS, NEEDS_TOOLS, Images
 from tests.release.stores import version
 
 pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 GLIBC = (28, 27, 26, 24, 17, 12, 5)  # 2.28 and what runs with it
+IN_DEBIAN_13 = """
+cd /root
+python3 -m venv venv
+venv/bin/pip install --quiet --no-cache-dir --constraint /given/constraints.txt "$(echo /given/sitegrid-*.whl)[demo]"
+venv/bin/python --version
+timeout 1200 venv/bin/sitegrid demo --headless --seconds 120 2>&1
+"""
 PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid")
 
 
@@ -60,6 +69,23 @@ def test_a_wheel_of_the_source_distribution_runs_a_demo_far_from_the_checkout(wh
     printed = run(sys.executable, "-m", "sitegrid", *words, folder=tmp_path, PYTHONPATH=str(site))
     assert json.loads(printed.splitlines()[-1])
     assert [*(tmp_path / "out").glob("*.png")]
+
+
+@pytest.mark.timeout(3000)
+@NEEDS_TOOLS
+def test_a_wheel_runs_a_demo_with_python_3_13_of_debian_13_and_without_pybullet(wheel: Path, tmp_path: Path) -> None:
+    (tmp_path / "given").mkdir()
+    for path in (wheel, ROOT / "constraints.txt"):
+        shutil.copy(path, tmp_path / "given")
+    with Images(tmp_path) as images:
+        mounts = (*MOUNTS, "--volume", f"{tmp_path / 'given'}:/given:ro")
+        words = ("--isolation", "chroot", *mounts, images.debian("trixie"), "--", "sh", "-ec", IN_DEBIAN_13)
+        printed = images.run("run", *words)
+    assert printed.startswith("Python 3.13.")
+    assert printed.count("the fast world takes the place of PyBullet") == 1
+    delivery = re.search(r"merged (\d+), lost 0, double 0", printed)
+    assert delivery, printed
+    assert int(delivery[1]) > 0
 
 
 @pytest.mark.parametrize(("python", "machine"), [("3.12", "x86_64"), *((f"3.{n}", "aarch64") for n in (11, 12, 13))])
