@@ -7,6 +7,7 @@ headers can lie.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any
 
 import msgpack
@@ -103,6 +104,11 @@ def _maps(node: Any) -> list[MapNode]:
     return [node, *below] if isinstance(node, MapNode) else below
 
 
+def _nasty(draw: DrawFn) -> Any:
+    """A hostile value of its own: later edits change it in place, and could put a shared one into itself."""
+    return deepcopy(draw(st.sampled_from(NASTY)))
+
+
 def _edit(draw: DrawFn, root: list[Any]) -> None:
     """Change one thing of a tree in place."""
     maps = [each for each in _maps(root) if each]
@@ -116,7 +122,7 @@ def _edit(draw: DrawFn, root: list[Any]) -> None:
     elif draw(st.integers(0, 5)) == 0:
         holder[i] = MapNode([["v", value]]) if draw(st.booleans()) else [value] * draw(st.sampled_from((1, 2, 30)))
     else:
-        holder[i] = draw(st.sampled_from(NASTY))
+        holder[i] = _nasty(draw)
 
 
 def _edit_map(draw: DrawFn, table: MapNode) -> None:
@@ -127,9 +133,9 @@ def _edit_map(draw: DrawFn, table: MapNode) -> None:
         case "rename":
             table[at] = [draw(st.sampled_from(_KEYS)), table[at][1]]
         case "twice":
-            table.append([table[at][0], draw(st.sampled_from(NASTY))])
+            table.append([table[at][0], _nasty(draw)])
         case "more":
-            table.append([draw(st.sampled_from(_KEYS)), draw(st.sampled_from(NASTY))])
+            table.append([draw(st.sampled_from(_KEYS)), _nasty(draw)])
 
 
 def _column(draw: DrawFn, data: bytes) -> bytes:
