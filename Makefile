@@ -16,7 +16,8 @@ venv: $(VENV)/.dev
 demo: $(VENV)/.demo
 	@$(BIN)/sitegrid demo --web
 
-# An extra of this project and all that it needs, without the 150 MB of PyBullet's examples. pip is silent while it unpacks: a terminal shows how far it is.
+# An extra of this project and all that it needs, without the 150 MB of PyBullet's examples. pip is silent while it
+# unpacks: a terminal shows how far it is.
 $(VENV)/.%: pyproject.toml constraints.txt
 	@"$(PYTHON)" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null || { \
 		echo "Python 3.11, 3.12 or 3.13 is needed, and '$(PYTHON)' is" \

@@ -234,9 +234,10 @@ def standstill(stamp_ns: int, tuning: LocalisationTuning = TUNING, *, turns: boo
     Never relocks: an articulated machine turns its rear frame by steering, also at standstill, and a joint sensor may
     be missing.
     """
-    R = np.diag([tuning.still_mps**2] * 3 + [(0.1 * tuning.rate_radps) ** 2] * 3 * (not turns))
-    states = VELOCITY if turns else slice(VELOCITY.start, RATE.stop)
-    return _nothing(STANDSTILL, stamp_ns, states, R, tuning.gate_sigma)
+    variances, states = [tuning.still_mps**2] * 3, VELOCITY
+    if not turns:
+        variances, states = variances + [(0.1 * tuning.rate_radps) ** 2] * 3, slice(VELOCITY.start, RATE.stop)
+    return _nothing(STANDSTILL, stamp_ns, states, np.diag(variances), tuning.gate_sigma)
 
 
 def _nothing(

@@ -36,7 +36,7 @@ from tests.memory import memory_mb
 from tests.site_work import START_NS
 
 OPTIONS = {"queries": 20}
-MOST_MB = 300.0  # of one question, and of all at once (issue 46)
+MOST_MB = 300.0  # of one question, and of all at once
 KNOWN_M, LANE_M, STEP_M, STD_M = 1888.0, 16.0, 2.0, 2.5  # 13,924 blocks, 195 MB: a past time may read 201
 SPEED_MPS = 10.0
 WAIT_S = 600.0  # for an answer

@@ -57,8 +57,8 @@ class Account:
 class BlockCredit:
     """The accounts of all machines. opened: keys of open blocks.
 
-    most: limit of jumps and driven [blocks]. per_m, jumps_per_m: earned per metre. known: no newcomers, once each.
-    signed: names are not free, so newcomers have full credit.
+    most: limit of jumps and driven [blocks]. per_m, jumps_per_m: earned per metre. journalled: machines of the
+    journal, no newcomers, once each. signed: names are not free, so newcomers have full credit.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class BlockCredit:
         cell_m: float,
         config: FoldConfig,
         opened: Iterable[Block],
-        known: Iterable[str] = (),
+        journalled: Iterable[str] = (),
         *,
         signed: bool = False,
     ) -> None:
@@ -82,7 +82,7 @@ class BlockCredit:
         self.most, self.jumps_per_m = float(JUMPS * blocks), blocks / JUMP_M
         self._bucket_ns, self._blocks = config.bucket_ns, blocks
         self._newcomers, self._newcomer_ns = 1.0, 0
-        self._known, self._signed = set(known), signed
+        self._journalled, self._signed = set(journalled), signed
 
     def spend(self, machine: str, rows: Table, trimmed: int = 0, now_ns: int = 0) -> None:
         """Open the blocks of a machine's new samples; trimmed: samples of the batch before them.
@@ -134,8 +134,8 @@ class BlockCredit:
         """The machine's account, with what time has earned."""
         known = self._accounts.pop(machine, None)
         if known is None:
-            share = 1.0 if self._signed or machine in self._known else self._newcomer_share(now_ns)
-            self._known.discard(machine)
+            share = 1.0 if self._signed or machine in self._journalled else self._newcomer_share(now_ns)
+            self._journalled.discard(machine)
             credit = Credit(self.most * share, 0.0, FIRST_PAGES * share)
             if len(self._accounts) >= MOST_ACCOUNTS:
                 del self._accounts[next(iter(self._accounts))]

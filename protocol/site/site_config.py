@@ -17,7 +17,7 @@ from protocol.site.geometry import GridGeometry
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 MAX_EXTENT_M = 100_000.0  # of any site
-LEAST_CELL_M = 0.05
+LEAST_CELL_M = 0.05  # of any map
 
 
 @dataclass(frozen=True)
