@@ -23,7 +23,6 @@ MAX_REPLY_BYTES = 2**23  # a piece has 0.8 MB, 2000 spans 1 MB
 MAX_CHANGES = 1000  # per answer
 MAX_CELL_M = 1e4
 MAX_PLACE_M = 1e7  # from the origin
-MAX_ITEMS = 100_000  # per list
 T = TypeVar("T")
 _hints = functools.cache(typing.get_type_hints)
 
@@ -41,7 +40,7 @@ def encode_point(answer: answers.PointAnswer) -> bytes:
 
 def decode_point(data: bytes) -> answers.PointAnswer:
     """Undo `encode_point`."""
-    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    table = unpack(data, MAX_REPLY_BYTES)
     x, y, values = take(table, "x_m", float), take(table, "y_m", float), _take_values(table)
     return answers.PointAnswer(x, y, values, decode_version(table), take(table, "stamp_ns", int))
 
@@ -55,7 +54,7 @@ def encode_points(answer: answers.PointsAnswer) -> bytes:
 
 def decode_points(data: bytes) -> answers.PointsAnswer:
     """Undo `encode_points`."""
-    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    table = unpack(data, MAX_REPLY_BYTES)
     x_m, y_m = (take_column(table, name) for name in ("x_m", "y_m"))
     if len(x_m) != len(y_m):
         raise MessageError(Refusal.COLUMN_LENGTH, f"{len(x_m)} places, and {len(y_m)}", field="y_m")
@@ -92,7 +91,7 @@ def encode_region(region: answers.Region) -> bytes:
 
 def decode_region(data: bytes) -> answers.Region:
     """Undo `encode_region`."""
-    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    table = unpack(data, MAX_REPLY_BYTES)
     cell_m, columns, rows = take(table, "cell_m", float), take(table, "columns", int), take(table, "rows", int)
     if not (LEAST_CELL_M <= cell_m <= MAX_CELL_M and columns > 0 and rows > 0 and columns * rows <= MAX_CELLS):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{columns} x {rows} cells of {cell_m} m", field="columns, rows")
@@ -145,7 +144,7 @@ def encode_history(answer: answers.HistoryAnswer) -> bytes:
 
 def decode_history(data: bytes) -> answers.HistoryAnswer:
     """Undo `encode_history`."""
-    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    table = unpack(data, MAX_REPLY_BYTES)
     spans = tuple(
         answers.HistorySpan(take(span, "first_ns", int), take(span, "last_ns", int), _take_values(span))
         for span in _take_tables(table, "spans")
@@ -206,7 +205,7 @@ def encode_info(info: answers.MapInfo | Mapping[str, Any]) -> bytes:
 
 def decode_info(data: bytes) -> answers.MapInfo:
     """Undo `encode_info`."""
-    return take_record(answers.MapInfo, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
+    return take_record(answers.MapInfo, unpack(data, MAX_REPLY_BYTES), "info")
 
 
 def encode_machines(answer: answers.MachinesAnswer) -> bytes:
@@ -226,7 +225,7 @@ def encode_machine(machine: answers.TrustAnswer | Mapping[str, Any]) -> bytes:
 
 def decode_machine(data: bytes) -> answers.TrustAnswer:
     """Undo `encode_machine`."""
-    return take_record(answers.TrustAnswer, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
+    return take_record(answers.TrustAnswer, unpack(data, MAX_REPLY_BYTES), "machine")
 
 
 def encode_changes(answer: answers.ChangesAnswer) -> bytes:
@@ -260,7 +259,7 @@ def take_record(cls: type[T], table: dict[str, Any], name: str) -> T:
 
 
 def _take_records(cls: type[T], data: bytes, name: str) -> tuple[tuple[T, ...], answers.MapVersion]:
-    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    table = unpack(data, MAX_REPLY_BYTES)
     rows: list[Any] = take(table, name, list)
     return tuple(_value(cls, row, f"{name}[{index}]") for index, row in enumerate(rows)), decode_version(table)
 

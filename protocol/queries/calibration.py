@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
-from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, take_record
+from protocol.queries.answer_codec import MAX_REPLY_BYTES, take_record
 from protocol.wire.fields import pack, unpack
 
 
@@ -73,4 +73,4 @@ def encode_calibration(answer: CalibrationAnswer) -> bytes:
 
 def decode_calibration(data: bytes) -> CalibrationAnswer:
     """Undo `encode_calibration`."""
-    return take_record(CalibrationAnswer, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "calibration")
+    return take_record(CalibrationAnswer, unpack(data, MAX_REPLY_BYTES), "calibration")

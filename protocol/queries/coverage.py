@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
-from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, take_record
+from protocol.queries.answer_codec import MAX_REPLY_BYTES, take_record
 from protocol.queries.parameters import RECTANGLE
 from protocol.queries.request import AsOf, Codec, Fresh, Size, asked
 from protocol.site.geometry import Bounds
@@ -35,7 +35,7 @@ def _encode(answer: Coverage) -> bytes:
 
 
 def _decode(data: bytes) -> Coverage:
-    return take_record(Coverage, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "coverage")
+    return take_record(Coverage, unpack(data, MAX_REPLY_BYTES), "coverage")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from protocol.wire.fields import inflated, pack, take, unpack
 
 TILE_CELLS = 64
 AREA = TILE_CELLS * TILE_CELLS
-MAX_TILES = 100_000  # per answer: a square of 20 km
 Plane = NDArray[np.uint8]
 
 
@@ -127,7 +126,7 @@ def encode_tiles(answer: TilesAnswer) -> bytes:
 
 def decode_tiles(data: bytes) -> TilesAnswer:
     """Undo `encode_tiles`; planes other than PLANES are refused."""
-    table = unpack(data, 2**28, MAX_TILES)
+    table = unpack(data, 2**28)
     if (names := take(table, "planes", list)) != list(PLANES):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{names!s:.80} are not {', '.join(PLANES)}", field="planes")
     tiles = tuple(_tile(row, index) for index, row in enumerate(take(table, "tiles", list)))

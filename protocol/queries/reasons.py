@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
-from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, take_record
+from protocol.queries.answer_codec import MAX_REPLY_BYTES, take_record
 from protocol.wire.fields import pack, unpack
 
 
@@ -53,4 +53,4 @@ def encode_why(reasons: CellReasons) -> bytes:
 
 def decode_why(data: bytes) -> CellReasons:
     """Undo `encode_why`."""
-    return take_record(CellReasons, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "why")
+    return take_record(CellReasons, unpack(data, MAX_REPLY_BYTES), "why")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TypeVar
 
-from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, take_record
+from protocol.queries.answer_codec import MAX_REPLY_BYTES, take_record
 from protocol.queries.parameters import LINE, RECTANGLE, STAMP, check_order, count, number
 from protocol.queries.request import AsOf, Codec, Fresh, asked
 from protocol.site.geometry import Bounds
@@ -134,7 +134,7 @@ def encode_segments(answer: Segments) -> bytes:
 
 def decode_segments(data: bytes) -> Segments:
     """Undo `encode_segments`."""
-    return take_record(Segments, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "segments")
+    return take_record(Segments, unpack(data, MAX_REPLY_BYTES), "segments")
 
 
 def encode_worklist(answer: Worklist) -> bytes:
@@ -144,7 +144,7 @@ def encode_worklist(answer: Worklist) -> bytes:
 
 def decode_worklist(data: bytes) -> Worklist:
     """Undo `encode_worklist`."""
-    return take_record(Worklist, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "worklist")
+    return take_record(Worklist, unpack(data, MAX_REPLY_BYTES), "worklist")
 
 
 @dataclass(frozen=True, kw_only=True)

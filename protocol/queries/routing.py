@@ -10,7 +10,6 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.errors import MessageError, Refusal
 from protocol.queries.answer_codec import (
-    MAX_ITEMS,
     MAX_REPLY_BYTES,
     decode_version,
     encode_version,
@@ -169,7 +168,7 @@ def encode_answer(answer: RouteAnswer) -> bytes:
 
 def decode_answer(data: bytes) -> RouteAnswer:
     """Undo `encode_answer`."""
-    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    table = unpack(data, MAX_REPLY_BYTES)
     line = take_column(table, "line")
     tables = take(table, "steps", dict)
     columns = {field.name: take_column(tables, field.name) for field in fields(RouteSteps)}

@@ -13,7 +13,6 @@ from protocol.site.site_config import NAME
 from protocol.wire.messages import VERSION
 
 MAX_SMALL_BYTES = 64 * 2**10
-MAX_ITEMS = 1000  # per list, except in answers: the decoder reserves memory for claimed sizes
 MAX_DEPTH = 16  # of plain values
 MAX_INT = 2**64 - 1  # of MessagePack
 STORE_ID = re.compile(r"[0-9a-f]{16}")
@@ -32,12 +31,18 @@ def _fitting(value: Any) -> int:
     raise TypeError(f"{type(value).__name__} is no value of MessagePack")
 
 
-def unpack(data: bytes, limit: int, items: int = MAX_ITEMS) -> dict[str, Any]:
-    """Undo `pack`; refuses what is too long, no map, or another version. items: most per list."""
+def unpack(data: bytes, limit: int) -> dict[str, Any]:
+    """Undo `pack`; refuses what is too long, no map, or another version.
+
+    A list reserves memory for as many items as it claims, so all claims are checked against the bytes first.
+    """
     if len(data) > limit:
         raise MessageError(Refusal.TOO_LARGE, f"{len(data)} bytes, at most {limit} are allowed")
     try:
-        table = msgpack.unpackb(data, max_array_len=min(items, len(data)))
+        claims = msgpack.Unpacker(max_buffer_size=len(data))
+        claims.feed(data)
+        claims.skip()
+        table = msgpack.unpackb(data)
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
         raise MessageError(Refusal.NOT_MSGPACK, f"not MessagePack, or cut off: {error}") from None
     if not isinstance(table, dict):

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import tracemalloc
 
 import msgpack
 import numpy as np
@@ -67,6 +68,15 @@ def refusal(data: bytes, decode=lambda data: decode_batch(data, EXTENT_M)) -> Me
 def test_what_is_cut_off_goes_on_or_is_no_map_is_refused(data):
     assert refusal(data).reason is Refusal.NOT_MSGPACK
     assert refusal(bytes(10 * 2**20)).reason is Refusal.TOO_LARGE, "and unread"
+
+
+def test_lists_that_claim_more_than_comes_reserve_no_memory():
+    nested = b"\x81\xa1v" + 200 * (b"\xdd" + (10**6).to_bytes(4, "big")) + bytes(10**6)
+    tracemalloc.start()
+    assert refusal(nested, lambda data: unpack(data, 2**21)).reason is Refusal.NOT_MSGPACK
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2 * len(nested), "200 lists of a million items would take 1.6 GB"
 
 
 @pytest.mark.parametrize(
