@@ -6,8 +6,8 @@
 
 60 faults are written by hand (`faults.toml`), 200 drawn by --seed over functions common to FOLDER and --common. A run
 of the suite with coverage by test selects each fault's tests; they stop at the first failure. Survivors get the tests
-of `make nightly` that run their lines. --quick omits that run: a fault gets the unit tests of its module's folder, then
-of its package.
+of `make nightly` that run their lines. --quick omits that run: a fault gets the unit tests of its module, then of its
+folder, then of its package.
 """
 
 from __future__ import annotations

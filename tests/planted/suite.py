@@ -109,13 +109,13 @@ class Suite:
             raise KeyError(fault.name)
         module = place.path.relative_to(root)
         mirror = f"tests/unit/{module.parent.as_posix()}/"
+        named = f"{mirror}test_{module.stem}.py"
         if self.quick:
             package = f"tests/unit/{module.parts[0]}"
-            return [folder for folder in dict.fromkeys([mirror, package]) if (root / folder).is_dir()]
+            return [path for path in dict.fromkeys([named, mirror, package]) if (root / path).exists()]
         lines = self._data.contexts_by_lineno(str(place.path))
         wanted = range(place.lines[0], place.lines[1] + 1)
         of_lines = _ids(lines, wanted)
-        named = f"{mirror}test_{module.stem}.py"
         ids = of_lines or _ids(lines, lines) | {test for test in self.seconds if test.startswith(mirror)}
         own = [test for test in self.seconds if test in ids]
         return sorted(own, key=lambda t: (not t.startswith(named), not t.startswith(mirror), self.seconds[t]))
