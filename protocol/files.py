@@ -52,7 +52,7 @@ def _read_text(path: Path) -> str:
 
 def _parse_toml(path: Path, text: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(text.replace("\r\n", "\n"))
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also of very long numbers and deep lists
         raise ConfigError(path, f"not valid TOML: {error}") from None
 

@@ -55,6 +55,7 @@ def test_values_and_defaults():
         ({"name": "a", "ratio": float("nan")}, ["ratio", "finite"]),
         ({"name": "a", "triple": [1, 2]}, ["triple", "3 values are expected, not 2"]),
         ({"name": "a", "triple": [1, "b", 3]}, ["triple[1]", "float is expected"]),
+        ({"name": "a", "triple": "1, 2, 3"}, ["x.toml triple: a list is expected, not str"]),
         ({"name": "a", "inner": 1}, ["inner", "a table is expected"]),
         ({"name": "a", "inner": {"deep": 1}}, ["x.toml inner", "unknown key `deep`"]),
         ({"name": "a", "named": [1]}, ["x.toml named", "a table is expected, not list"]),

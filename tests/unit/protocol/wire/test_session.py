@@ -24,6 +24,13 @@ def test_client_listens_nowhere_and_router_at_its_endpoint():
     assert _settings(SessionConfig("tcp/127.0.0.1:1", mode="router"))["listen/endpoints"] == ["tcp/127.0.0.1:1"]
 
 
+@pytest.mark.parametrize(("wait_s", "mode", "wait_ms"), [(2.5, "client", 2500), (0.0, "client", 0), (-1.0, "peer", -1)])
+def test_a_client_waits_for_its_router_and_a_peer_connects_in_the_background(wait_s: float, mode: str, wait_ms: int):
+    settings = _settings(SessionConfig(wait_s=wait_s))
+    assert (settings["mode"], settings["connect/timeout_ms"]) == (mode, wait_ms)
+    assert settings["connect/exit_on_failure"] is (mode == "client")
+
+
 def test_a_whole_answer_fits_into_what_a_router_keeps_for_a_link():
     batches = _settings(SessionConfig(mode="router"))["transport/link/tx/queue/size/data"]
     assert batches * 65_000 >= PIECE_BYTES + 2**14  # the rest of the answer, and headers
