@@ -60,6 +60,17 @@ def test_estimates_state_the_mass_as_it_is_weighed(mass: str, stated_kg: float) 
         assert estimate.c_rr == pytest.approx(0.06 + wrong, abs=0.005)
 
 
+def test_the_first_step_answers_for_itself_and_a_moment_before() -> None:
+    """Of two steps around a stamp the nearest one answers; none beyond 0.2 s."""
+    run = EstimatorRun(VEHICLE).feed(drive([STAND, START], VEHICLE).readings)
+    begin_ns, after_ns = (judged.stamp_ns for judged in list(run.estimator._judged)[:2])
+    judged = [run.estimator._nearest(begin_ns + ns) for ns in (-200_000_001, -200_000_000, 0, 1)]
+    assert [one and one.stamp_ns for one in judged] == [None, begin_ns, begin_ns, begin_ns]
+    nearer = run.estimator._nearest(after_ns - 1)
+    assert nearer
+    assert nearer.stamp_ns == after_ns
+
+
 # --- uncertainty -----------------------------------------------------------------------------------------------------
 
 

@@ -76,7 +76,9 @@ def test_a_load_that_changes_at_a_stop_is_found_again_sooner() -> None:
     for loads in (True, False):
         rls = RecursiveResistance(estimates_mass=True)
         feed(rls, level_steps(0.05 + 0 * share, share=share))
+        known = rls._squares.variance[0]
         rls.stand(changes_load=loads)
+        assert rls._squares.variance[0] == (min(10 * known, 1e-2) if loads else known)
         feed(rls, level_steps(0.05 + 0.15 * share[:400], share=share[:400]))
         estimates.append(abs(rls._squares.parameters[0] - 0.15))
     assert estimates[0] < estimates[1] - 1e-3

@@ -10,7 +10,7 @@ from agents.localisation.filters.belief import Belief, Filter, Measurement, Moti
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.motion import GpsError, MotionModel, map_from_base, motion
 from agents.localisation.filters.state import ATTITUDE, PITCH, RATE, ROLL, VELOCITY, YAW, Layout
-from agents.localisation.filters.ukf import Ukf
+from agents.localisation.filters.ukf import SigmaPoints, Ukf
 from protocol.arrays import Floats
 
 STEPS = 1500
@@ -152,12 +152,16 @@ def test_its_steps_are_filterpys(kind: Ukf) -> None:
         ({"alpha": 1.0, "beta": 0.9}, "beta"),
         ({"beta": math.inf}, "beta"),
         ({"kappa": math.nan}, "kappa"),
-        ({"kappa": -3.0}, "kappa"),  # too small for two states
+        ({"kappa": -2.0}, "kappa"),  # too small for two states
     ],
 )
 def test_bad_option_is_refused_by_name(options: dict[str, float], named: str) -> None:
     with pytest.raises(ValueError, match=named):
         Ukf(**options).condition(believed(np.zeros(2), np.eye(2)), linear([0.0], [[1.0, 0.0]], [[1.0]]))
+
+
+def test_the_least_kappa_leaves_a_spread() -> None:
+    assert SigmaPoints(2, 1, alpha=1.0, beta=2.0, kappa=-1.75).gamma == 0.5
 
 
 # --- refusals --------------------------------------------------------------------------------------------------------
