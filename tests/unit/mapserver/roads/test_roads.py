@@ -9,6 +9,7 @@ import pytest
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.roads.cutting import LATTICE_M, LEAST_M, SLIVER_M, cut
+from mapserver.roads.ridges import AXES, Blur
 from mapserver.roads.segments import SegmentTable
 from mapserver.roads.skeleton import Skeletons
 from protocol.arrays import Floats
@@ -37,6 +38,13 @@ def same(one: SegmentTable, other: SegmentTable) -> bool:
     return one.ids == other.ids and all(
         getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in arrays
     )
+
+
+def test_an_axis_is_compared_with_what_lies_across_it():
+    across, turns = Blur(0.5).across, np.pi * np.arange(AXES)[:, None] / AXES  # (AXES, steps, 2) [row, column]
+    steps = [step for step in range(-6, 7) if step]  # 3 m to both sides
+    assert np.abs(across[..., 1] * np.cos(turns) + across[..., 0] * np.sin(turns)).max() < 1
+    assert np.abs(across[..., 0] * np.cos(turns) - across[..., 1] * np.sin(turns) - steps).max() < 1
 
 
 def test_a_straight_road_is_cut_at_the_lattice():
