@@ -18,7 +18,7 @@ from protocol.queries.requests import parse_query
 from protocol.queries.route_requests import REFUSE, TIME, RouteQuery, WayQuery
 from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteAnswer, RouteMachine, decode_answer
 from protocol.units import GRAVITY_MPS2
-from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, refused, samples, send
+from tests.unit.mapserver.data import NOW_NS, SITE, incoming, open_writer, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 
 HALF = 60
@@ -38,8 +38,8 @@ def ground(resistance, grade_e=lambda x, y: 0 * x, skipped=lambda x, y: x != x):
 
 
 @contextmanager
-def answers_on(folder: Path, rows: Table) -> Iterator[Answers]:
-    with closing(open_writer(folder)) as writer:
+def answers_on(folder: Path, rows: Table, cell_m: float = 1.0) -> Iterator[Answers]:
+    with closing(open_writer(folder, site=replace(SITE, cell_m=cell_m))) as writer:
         send(writer, [incoming(rows)])
         yield answers_of(writer)
 
@@ -70,14 +70,15 @@ def test_two_soils_cost_what_each_does_over_its_length(tmp_path):
         assert (there.merged, there.totals.unknown, there.line_m.tolist()) == (1, 0.0, [[-40, 5], [40, 5]])
 
 
-def test_a_way_leads_around_sand_and_costs_less_than_straight(tmp_path):
-    sand = lambda x, y: (abs(x) < 15) & (y < 25)  # noqa: E731
-    with answers_on(tmp_path, ground(lambda x, y: np.where(sand(x, y), 0.25, 0.02))) as answers:
+@pytest.mark.parametrize(("cell_m", "edge_m"), [(1.0, 25), (2.0, 40)])
+def test_a_way_leads_around_sand_and_costs_less_than_straight(tmp_path, cell_m, edge_m):
+    sand = lambda x, y: (abs(x) < 15) & (y < edge_m)  # noqa: E731
+    with answers_on(tmp_path, ground(lambda x, y: np.where(sand(x, y), 0.25, 0.02)), cell_m) as answers:
         ends = (-40.0, 0.0), (40.0, 0.0)
         way = ask(answers, WayQuery(*ends, machine=SLOW, stops=ROLLING))
         straight = ask(answers, RouteQuery(ends, machine=SLOW, stops=ROLLING))
         assert way.line_m[[0, -1]].tolist() == [[-40, 0], [40, 0]]
-        assert way.line_m[:, 1].max() > 24
+        assert way.line_m[:, 1].max() > edge_m - cell_m
         assert way.totals.energy_j < 0.5 * straight.totals.energy_j
         assert way.steps.resistance.max() < 0.1
         again = ask(answers, RouteQuery(tuple(map(tuple, way.line_m.tolist())), machine=SLOW, stops=ROLLING))
