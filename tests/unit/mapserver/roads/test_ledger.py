@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from mapserver.evidence.fold_config import name_hash
-from mapserver.roads.ledger import Ledgers
+from mapserver.roads.ledger import Ledgers, _places
 from mapserver.roads.loss import losses
-from mapserver.roads.tally import PER_C, PER_M, Tally
+from mapserver.roads.tally import PER_C, PER_M, TALLY, Tally, place
 from mapserver.roads.worklist import theil_sen
 from protocol.units import GRAVITY_MPS2
 from tests.unit.mapserver.roads.drives import along, passes, roads
@@ -44,6 +44,15 @@ def test_sums_are_those_of_the_samples():
     assert table["weighed"].sum() == metres[weighed].sum()
     assert table["kg"].sum() == (metres * 40_000)[weighed].sum()
     assert table["c"].sum() == (metres * np.rint(rows["c_rr"].astype(float) * PER_C))[known].sum()
+
+
+@pytest.mark.parametrize("places", [3, 9000])  # beyond the first size of the table
+def test_rows_of_a_place_find_each_other(places):
+    rows = np.zeros(30_000, TALLY)
+    rows["key"] = np.random.default_rng(1).integers(0, 2**40, places)[np.arange(len(rows)) * 7919 % places]
+    which, numbers = _places(rows)
+    assert len(set(numbers.tolist())) == len(numbers) == len(set(place(rows["key"]).tolist()))
+    np.testing.assert_array_equal(numbers[which], place(rows["key"]))
 
 
 def test_the_oldest_hours_are_forgotten_whatever_the_order():

@@ -9,7 +9,7 @@ import pytest
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.roads.cutting import LATTICE_M, LEAST_M, SLIVER_M, cut
-from mapserver.roads.ridges import AXES, Blur
+from mapserver.roads.ridges import AXES, Blur, _outstanding
 from mapserver.roads.segments import SegmentTable
 from mapserver.roads.skeleton import Skeletons
 from protocol.arrays import Floats
@@ -45,6 +45,25 @@ def test_an_axis_is_compared_with_what_lies_across_it():
     steps = [step for step in range(-6, 7) if step]  # 3 m to both sides
     assert np.abs(across[..., 1] * np.cos(turns) + across[..., 0] * np.sin(turns)).max() < 1
     assert np.abs(across[..., 0] * np.cos(turns) - across[..., 1] * np.sin(turns) - steps).max() < 1
+
+
+def test_an_axis_that_its_neighbour_outdoes_is_no_ridge():
+    blur = Blur(1.0)
+    response = np.zeros((AXES, 2 * blur.side + 1, 2 * blur.side + 1))
+    for axis in range(AXES):
+        for stronger in ((axis + 1) % AXES, axis - 1):
+            response[:] = 0.0
+            response[axis, blur.side, blur.side] = 2 * blur.least.max()
+            assert outstands(response, blur)
+            response[stronger, blur.side, blur.side] = 3 * blur.least.max()
+            response[stronger, *(blur.side + blur.across[stronger, 0])] = 9 * blur.least.max()  # a lane beside
+            assert not outstands(response, blur)
+
+
+def outstands(response, blur: Blur) -> bool:
+    out = np.zeros((1, 1), np.bool_)
+    _outstanding(response, blur.side, blur.least, blur.across, out)
+    return bool(out[0, 0])
 
 
 def test_a_straight_road_is_cut_at_the_lattice():

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mapserver.routes.drive import CREEP_MPS, LATE_S, Drive, drive
+from mapserver.routes.drive import CREEP_MPS, LATE_S, Drive, drive, smoothed
 from mapserver.routes.ground import CURVE_M, Squares, limits, steps
 from protocol.arrays import Floats
 from protocol.queries.routing import RouteMachine
@@ -58,6 +58,13 @@ def test_what_the_power_cannot_do_is_said() -> None:
     done = rolling(0.03, slope, weak)
     assert 400 <= done.stalls <= 402
     assert rolling(0.03, 0.2, weak).stalls == -1
+    slope[0] = 2.0
+    assert rolling(0.03, slope, weak).stalls == 0, "the first of two"
+
+
+def test_ground_is_smoothed_over_what_there_is() -> None:
+    assert smoothed(np.array([1.0, 2.0, 9.0]), 0.5).tolist() == [4.0, 4.0, 4.0]
+    assert smoothed(np.array([7.0]), 0.5).tolist() == [7.0]
 
 
 def test_changes_of_the_ground_cost_what_drivers_answer_late() -> None:
