@@ -1,8 +1,8 @@
 """Memory that a visitor's worst questions cost the map server and the web server.
 
-Each question asks of fresh servers, over HTTP, or over Zenoh where that allows more, what its limits allow of a square
-of known ground. Figures are peaks over memory at rest: of one question, then of some at once, none taken in before all
-are being answered.
+Each question asks, over HTTP, or over Zenoh where that allows more, what its limits allow of a square of known ground.
+Figures are peaks over memory before it: of one question, then of some at once, none taken in before all are being
+answered. The last row is what stays after all questions: what visitors share.
 """
 
 from __future__ import annotations
@@ -125,6 +125,7 @@ def run(queries: int) -> Iterator[Row]:
             visited = Visited(site.endpoint, url, {"server": server, "web": web})
             for name, question in questions().items():
                 yield from rows_of(name, visited.cost(question, queries))
+            yield from rows_of("stays", visited.stays())
 
 
 class Visited:
@@ -132,18 +133,25 @@ class Visited:
 
     def __init__(self, endpoint: str, url: str, pids: Mapping[str, int]) -> None:
         self._endpoint, self._port, self._pids = endpoint, urlsplit(url).port or 80, pids
-        self._rest_mb = {role: memory_mb(pid=pid) for role, pid in pids.items()}
+        self._rest_mb = self._used_mb()
+
+    def _used_mb(self, kind: str = "VmRSS") -> dict[str, float]:
+        return {role: memory_mb(kind, pid) for role, pid in self._pids.items()}
 
     def cost(self, question: str, count: int) -> Figures:
-        """Peaks over rest [MB] of one question and of `count` at once, and how many of these were answered."""
+        """Peaks [MB] of one question and of `count` at once, and how many of these were answered."""
         figures: dict[str, float | None] = {}
         for many, n in (("one", 1), ("many", count)):
             for pid in self._pids.values():
                 forget_peak_mb(pid)
+            before_mb = self._used_mb()
             figures[f"answered_{many}"] = self._asked(question, n)
-            peaks_mb = {role: memory_mb("VmHWM", pid) for role, pid in self._pids.items()}
-            figures |= {f"{role}_{many}_mb": peak_mb - self._rest_mb[role] for role, peak_mb in peaks_mb.items()}
+            figures |= {f"{role}_{many}_mb": mb - before_mb[role] for role, mb in self._used_mb("VmHWM").items()}
         return figures
+
+    def stays(self) -> Figures:
+        """Growth [MB] since rest."""
+        return {f"{role}_mb": mb - self._rest_mb[role] for role, mb in self._used_mb().items()}
 
     def _asked(self, question: str, count: int) -> int:
         if question.startswith("/"):

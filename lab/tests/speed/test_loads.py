@@ -31,7 +31,7 @@ SMALLEST = {
         "--hours 0.1 --queries 2",
         ["cold way", "cold as_of", "warm way", "warm as_of"],
     ),
-    "visitors": ("--queries 2", [*visitors.questions()]),
+    "visitors": ("--queries 2", [*visitors.questions(), "stays"]),
     "restart": ("--samples 1950 --hours 0.02 --runs 1", ["open, rows of 6", "fold, 2 threads", "grid", "server"]),
     "filter": ("--steps 3 --runs 1", ["stock ukf, predict", "ekf, update rate", "ukf and smoother", "agent"]),
     "sim": ("--seconds 0.5 --runs 2", ["pybullet, 1", "fast, 3"]),
