@@ -1,13 +1,15 @@
 """The segment ledger: exact sums by hour and direction in any order; trends and losses of known ground."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
 from mapserver.evidence.fold_config import name_hash
 from mapserver.roads.ledger import Ledgers, _places
-from mapserver.roads.loss import losses
+from mapserver.roads.loss import Losses, losses
 from mapserver.roads.tally import PER_C, PER_M, TALLY, Tally, place
-from mapserver.roads.worklist import theil_sen
+from mapserver.roads.worklist import ranked, theil_sen
 from protocol.units import GRAVITY_MPS2
 from tests.unit.mapserver.roads.drives import along, passes, roads
 
@@ -116,3 +118,16 @@ def test_a_descent_that_brakes_anyway_costs_nothing():
 
 def test_one_day_of_rain_is_no_trend():
     assert theil_sen(np.arange(7), np.array([0.02, 0.02, 0.02, 0.09, 0.02, 0.02, 0.02])) == 0.0
+
+
+def test_traffic_where_no_road_is_belongs_to_none():
+    ledgers = Ledgers(roads(passes(along([(0, 0), (2, 0)]))))
+    assert not len(ledgers.segments.ids)
+    kept = tally_of(passes(LINE))
+    assert not len(ledgers.ledger(kept.table(), kept.slot_ns).rows)
+
+
+def test_losses_that_nearly_equal_the_highest_of_their_rank_tie():
+    work_j = np.array([94.9, 100.0, 90.0, 95.1, 80.0, 86.0]) * 1e6
+    losses_of = Losses(**{field.name: work_j for field in fields(Losses)})
+    assert ranked(replace(losses_of, low_j=np.where(work_j == 80e6, -1.0, 1.0))).rank.tolist() == [1, 1, 3, 3, 5]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.operators.course import BEYOND_M, build_course, spread_starts
-from sim.operators.routes import SPACING_M, Route, open_leg, tour
+from sim.operators.routes import BRAKING_MPS2, LATERAL_MPS2, SPACING_M, Leg, Route, open_leg, speed_limits, tour
 
 SQUARE = ((0.0, 0.0), (100.0, 0.0), (100.0, 100.0), (0.0, 100.0))
 HOOK = ((0.0, 0.0), (40.0, 0.0), (50.0, 20.0), (50.0, 60.0))
@@ -18,6 +18,15 @@ def test_tour_is_even_closed_and_rounded() -> None:
     assert lap.length_m == pytest.approx(step.sum(), rel=1e-3)
     assert 1 / np.abs(lap.curvature()).max() == pytest.approx(0.886 * 5.0, rel=0.05)
     assert lap.curvature().sum() * lap.spacing_m == pytest.approx(2 * math.pi)
+
+
+@pytest.mark.parametrize("leg", [*tour(SQUARE, 5.0).legs, open_leg(HOOK)], ids=["lap", "hook"])
+def test_limits_are_of_the_bend_and_of_brakes_before_it(leg: Leg) -> None:
+    limit, bend = speed_limits(leg, 6.0), np.sqrt(LATERAL_MPS2 / np.maximum(np.abs(leg.curvature()), 1e-6))
+    following = np.roll(limit, -1) if leg.closed else np.append(limit[1:], limit[-1])
+    braked = np.sqrt(following**2 + 2 * BRAKING_MPS2 * leg.spacing_m)
+    np.testing.assert_allclose(limit, np.minimum(np.minimum(bend, 6.0), braked), atol=1e-9)
+    assert limit.max() == 6.0 > limit.min()
 
 
 def test_course_follows_laps_and_goes_straight_on_beyond_open_ends() -> None:
