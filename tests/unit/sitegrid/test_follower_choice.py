@@ -112,7 +112,7 @@ def test_one_that_dies_or_hangs_is_replaced_and_not_asked_again_for_a_while(sile
     assert {first, other} == {"a", "b"}
     one.ask(PointQuery(0, 0))
     assert site.whom == [first, first, other, other]
-    assert max(site.timeouts) <= 5.0  # half of the time, then another one
+    assert 4.9 < max(site.timeouts) <= 5.0  # half of the time, then another one
 
 
 def test_where_all_followers_are_silent_the_server_is_asked():

@@ -112,3 +112,11 @@ def test_what_an_agent_lacks_is_named(files: Path):
 def test_agent_keeps_its_calibration_beside_the_spool_or_where_it_is_told(words: list[str], expected: str) -> None:
     arguments = build_parser().parse_args(["agent", "--spool", "a.db", *words])
     assert agent._calibration(arguments) == Path(expected)
+
+
+def test_a_page_shows_sites_by_name_and_endpoint(capsys):
+    words = ["web", "--site", "pit=tcp/127.0.0.1:7448", "--site", "north"]
+    assert build_parser().parse_args(words).sites == [("pit", "tcp/127.0.0.1:7448"), ("north", None)]
+    with pytest.raises(SystemExit):
+        build_parser().parse_args(["web", "--site", "a/b"])
+    assert "a/b" in capsys.readouterr().err

@@ -65,9 +65,10 @@ def test_a_server_too_busy_for_a_picture_does_not_end_the_demo(tmp_path: Path, m
 
 
 def test_an_earlier_run_is_cleared_away(tmp_path: Path):
-    old = plan_of(tmp_path).work / "loader-9.db"
+    out = tmp_path / "made" / "by the demo"
+    old = plan_of(out).work / "loader-9.db"
     old.write_text("old")
-    plan_of(tmp_path)
+    plan_of(out)
     assert not old.exists()
 
 

@@ -16,3 +16,18 @@ def test_nobody_waits_for_machines_once_the_site_was_listened_to_for_long_enough
             feed.heard().send(None)
 
     asyncio.run(ask())
+
+
+def test_pages_that_watch_are_counted(monkeypatch: pytest.MonkeyPatch):
+    async def follow(feed: SiteFeed) -> None: ...
+
+    async def watch() -> list[int]:
+        feed, counts = SiteFeed(SimpleNamespace(site="pit")), []
+        async with feed.watched():
+            async with feed.watched():
+                counts.append(feed.watchers)
+            counts.append(feed.watchers)
+        return [*counts, feed.watchers]
+
+    monkeypatch.setattr(SiteFeed, "_follow", follow)
+    assert asyncio.run(watch()) == [2, 1, 0]
