@@ -130,6 +130,8 @@ def test_nothing_is_overwritten(folder: Path, capsys):
 @pytest.mark.parametrize("name", ["Loader", "a.2", "a/b", "*", "", "a b", "ä"])
 def test_odd_names_are_refused(folder: Path, name: str, capsys):
     assert "is not a name" in refused(capsys, folder, "add", name)
+    of_authority = refused(capsys, folder, "add", "authority")
+    assert "keys add: 'authority' is the folder of the authority; choose another name" in of_authority
 
 
 @pytest.mark.parametrize("host", ["bad host", "a..b", "-x", "höst", "x" * 64, ""])
