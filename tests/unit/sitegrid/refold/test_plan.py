@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from mapserver.journal.rows import ALL, JournalRow, Selection
 from protocol.errors import SitegridError, StoreError
 from sitegrid.refold.engine import Here
-from sitegrid.refold.plan import Plan, plan
+from sitegrid.refold.plan import Plan, _overlaps, plan
 from sitegrid.refold.work import FoldTask, PartWork, fold_parts
 from tests.unit.sitegrid.refold.archives import T0, S, fold_in, samples, write
 
@@ -27,6 +28,19 @@ def kept_of(planned: Plan) -> list[tuple[str, int, int]]:
         for first, last in intervals
         for seq in range(first, last + 1)
     ]
+
+
+def test_each_sample_of_a_later_part_is_compared_with_the_first_that_has_it() -> None:
+    for seed in range(50):
+        rng, parts, first_of, expected = np.random.default_rng(seed), [], {}, set()
+        for at in range(4):
+            ends = np.sort(rng.choice(12, 2 * int(rng.integers(1, 4)), replace=False)).reshape(-1, 2).tolist()
+            parts.append(SimpleNamespace(intervals={"spool": [(first, last - 1) for first, last in ends]}))
+            for seq in (seq for first, last in ends for seq in range(first, last)):
+                if (of := first_of.setdefault(seq, at)) != at:
+                    expected.add((at, of, seq))
+        shared = [(at, of, seq) for at, of, _, (a, b) in _overlaps(parts) for seq in range(a, b + 1)]
+        assert sorted(shared) == sorted(expected)
 
 
 @pytest.mark.parametrize("seed", range(3))
