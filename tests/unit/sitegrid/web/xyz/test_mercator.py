@@ -45,9 +45,10 @@ def test_values_survive_24_bits():
 
 def test_unknown_is_transparent_and_colours_grow_lighter():
     values = np.full((256, 256), np.nan)
-    values[0, :3] = 0.008, 0.06, 0.25
-    image = decoded(colour_png(values, "resistance"))
-    assert (image[..., 3] > 0).sum() == 3
-    assert image[0, 0, 1] < image[0, 1, 1] < image[0, 2, 1]
+    for layer, low, middle, high in (("resistance", 0.006, 0.0424, 0.3), ("grade", 0.0, 0.15, 0.3)):
+        values[0, :4] = low, middle, high, 2 * high
+        image = decoded(colour_png(values, layer))
+        assert (image[..., 3] > 0).sum() == 4
+        np.testing.assert_allclose(image[0, :4, :3], mercator.ORDERED[[0, 3, 6, 6]], atol=1)
     assert decoded(mercator.empty_png("colour"))[..., 3].max() == 0
     assert decoded(mercator.empty_png("value")).shape == decoded(value_png(values, "resistance")).shape
