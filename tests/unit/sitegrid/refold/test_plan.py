@@ -37,9 +37,9 @@ def test_each_sample_of_a_later_part_is_compared_with_the_first_that_has_it() ->
             ends = np.sort(rng.choice(12, 2 * int(rng.integers(1, 4)), replace=False)).reshape(-1, 2).tolist()
             parts.append(SimpleNamespace(intervals={"spool": [(first, last - 1) for first, last in ends]}))
             for seq in (seq for first, last in ends for seq in range(first, last)):
-                if (of := first_of.setdefault(seq, at)) != at:
-                    expected.add((at, of, seq))
-        shared = [(at, of, seq) for at, of, _, (a, b) in _overlaps(parts) for seq in range(a, b + 1)]
+                if (earlier := first_of.setdefault(seq, at)) != at:
+                    expected.add((at, earlier, seq))
+        shared = [(at, earlier, seq) for at, earlier, _, (a, b) in _overlaps(parts) for seq in range(a, b + 1)]
         assert sorted(shared) == sorted(expected)
 
 
