@@ -24,7 +24,7 @@ from protocol.errors import ConfigError
 from sitegrid.proof.figures import Report, Row, rounded
 
 SETTLED_S = 60.0  # judged afterwards
-REPEATED = ("loading", "haul", "two", "both", "crossings", "free")
+REPEATED = ("loading", "haul", "slopes", "two", "both", "crossings", "free")
 
 
 @dataclass(frozen=True)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,8 @@ def test_scenario_over_a_base_replaces_key_by_key(tmp_path: Path) -> None:
     base = load_scenario("paper_site")
     assert (mine.seed, mine.machine_names) == (7, ("digger",))
     assert (mine.ground, mine.route, mine.site) == (base.ground, base.route, base.site)
+    waves = load_scenario(write(tmp_path, "[ground]\nundulation_cm3 = 16.0\n"))
+    assert waves.ground == replace(base.ground, undulation_cm3=16.0)
 
 
 def test_fleet_takes_its_routes_in_turn(tmp_path: Path) -> None:
