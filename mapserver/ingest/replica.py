@@ -60,7 +60,8 @@ class Replica:
                 self.changes[change.id] = change
         self.tail.heard(events)
         if self.wanted == self.facts:
-            self.facts = self.wanted  # with a higher number
+            self.grid.renew(self.facts.repairs.differing(self.wanted.repairs))
+            self.facts = self.wanted  # with a higher number, and other repairs
 
     def fold(self, rows: JournalRows) -> None:
         """Fold the next rows."""

@@ -213,7 +213,7 @@ def test_damaged_corrections_of_an_archive_are_not_folded_without(tmp_path: Path
     path = source / FOLDER / archived_decisions.FILE
     path.write_text(path.read_text().replace("0.02", "0.03"))
     assert run(source / FOLDER, "--out", tmp_path / "new") == 1
-    assert "calibration.json: is damaged" in capsys.readouterr().err
+    assert "decisions.json: is damaged" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
