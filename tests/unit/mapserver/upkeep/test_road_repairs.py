@@ -129,7 +129,6 @@ def test_a_repair_that_rested_on_a_machine_goes_with_it_and_returns_with_it(site
     assert [event.cells for event in site.events()[len(found) :]] == [()] * len(found)
     assert not site.writer.run(lambda store: store.facts.repairs.standing)
     with closing(Site(tmp_path / "alone")) as alone:
-        alone.drives(0.0, 0.0, 0, "")
         send(alone.writer, [incoming(row.rows, machine="a", spool_id=row.row) for row in rows_of(site, "a")])
         np.testing.assert_array_equal(site.resistance(), alone.resistance())
     site.decides(replace(GONE, trusted=True))
