@@ -24,7 +24,7 @@ from protocol.wire.messages import CalibrationOffer
 GroundDecision = CalibrationDecision | RoadRepair  # about samples and roads, as archives have them
 MachineDecision = TrustDecision | CalibrationDecision
 Decision = MachineDecision | RoadRepair
-_DECODERS: dict[str, Callable[[Any], Decision]] = {
+DECODERS: dict[str, Callable[[Any], Decision]] = {
     trust.KIND: lambda body: TrustDecision(**body),
     CALIBRATION: CalibrationDecision.from_body,
     REPAIR: RoadRepair.from_body,
@@ -34,20 +34,22 @@ _DECODERS: dict[str, Callable[[Any], Decision]] = {
 class Decisions:
     """Decisions of all kinds. facts: their result."""
 
-    def __init__(self) -> None:
+    def __init__(self, cell_m: float | None = None) -> None:
+        """cell_m: of the map; repairs of roads on other cells do not count, so the search finds them again."""
+        self._cell_m = cell_m
         self.trust, self.calibration, self._repairs = TrustDecisions(()), CalibrationDecisions(), NO_REPAIRS
         self.facts = Facts()
 
     @classmethod
-    def of_journal(cls, journal: JournalQueries) -> Decisions:
+    def of_journal(cls, journal: JournalQueries, cell_m: float | None = None) -> Decisions:
         """A journal's decisions; StoreError if another program wrote one."""
-        decisions = cls()
+        decisions = cls(cell_m)
         decisions.hear(journal.events(), journal.where)
         return decisions
 
     def hear(self, events: Iterable[Event], where: str) -> None:
         """Apply decisions among further events; StoreError as `of_journal`."""
-        decided = [event for event in events if event.kind in _DECODERS]
+        decided = [event for event in events if event.kind in DECODERS]
         self.add([_decision(event, where) for event in decided], decided[-1].id if decided else self.facts.number)
 
     def add(self, decisions: Sequence[Decision], number: int) -> None:
@@ -57,7 +59,8 @@ class Decisions:
                 self.calibration.add(decision)
             elif isinstance(decision, TrustDecision):
                 self.trust.add(decision)
-        if repairs := [decision for decision in decisions if isinstance(decision, RoadRepair)]:
+        repairs = [decision for decision in decisions if isinstance(decision, RoadRepair)]
+        if repairs := [repair for repair in repairs if repair.cell_m == self._cell_m]:
             self._repairs = self._repairs.after(repairs)
         excluded, corrections = self.trust.distrusted, self.calibration.corrections
         if excluded:  # corrections of excluded samples change no map
@@ -81,7 +84,7 @@ class Decisions:
 
 def ground_decisions(journal: JournalQueries) -> list[GroundDecision]:
     """A journal's decisions about samples and roads, in order; StoreError as `Decisions.of_journal`."""
-    decisions = (_decision(event, journal.where) for event in journal.events() if event.kind in _DECODERS)
+    decisions = (_decision(event, journal.where) for event in journal.events() if event.kind in DECODERS)
     return [decision for decision in decisions if not isinstance(decision, TrustDecision)]
 
 
@@ -94,7 +97,7 @@ def plain(decision: Decision) -> tuple[str, int, Mapping[str, Any]]:
 
 def _decision(event: Event, where: str) -> Decision:
     try:
-        return _DECODERS[event.kind](event.body)
+        return DECODERS[event.kind](event.body)
     except (ValueError, TypeError, LookupError) as error:
         problem = f"event {event.id} is of another program ({error}); open the store with that one"
         raise StoreError(where, problem) from None

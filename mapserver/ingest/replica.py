@@ -28,7 +28,7 @@ class Replica:
         self.grid, self.facts = Grid(site.cell_m, config.fold), Facts()
         self.merged = 0
         self.changes: dict[int, GroundChange] = {}
-        self._decisions = Decisions()
+        self._decisions = Decisions(site.cell_m)
         self._newest_ns: dict[str, int] = {}
 
     @property

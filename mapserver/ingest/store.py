@@ -79,7 +79,7 @@ class Store:
             self.history = History(self.journal, location.archive)
             self.identity = self.journal.identity()
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
-            self._decisions, last_row = Decisions.of_journal(self.journal), self.journal.last_row
+            self._decisions, last_row = Decisions.of_journal(self.journal, site.cell_m), self.journal.last_row
             self.facts = facts = self._decisions.facts
             self.shortfalls = name_shortfalls(self.journal, snapshot_rows(folder))
             remove_beyond(folder, self.journal.trusted_row)

@@ -199,7 +199,7 @@ class RoadMaps:
         """
         newest, asked_s = self._newest, self._ask()
         if not newest or asked_s - newest.looked_s >= newest.lasts_s:
-            if not self._lock.acquire(blocking=False):
+            if not self._source.run(lambda state: state.version.row) or not self._lock.acquire(blocking=False):
                 return None
             try:
                 with _journal_read():

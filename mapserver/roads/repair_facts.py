@@ -6,6 +6,7 @@ its age. An event without cells withdraws the repair of its segment and first pa
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -32,7 +33,7 @@ class RoadRepair:
     """A change of a segment's ground, as in its event.
 
     known_ns, first_ns, seen_ns: earliest pass that it rests on, first pass after it, and its proof. before, after:
-    median c_rr. cells: those with new ground; none withdraws it. stamp_ns: site time of the decision.
+    median c_rr. cells: those of cell_m with new ground; none withdraws it. stamp_ns: site time of the decision.
     """
 
     segment: str
@@ -41,6 +42,7 @@ class RoadRepair:
     seen_ns: int
     before: float
     after: float
+    cell_m: float
     cells: Cells
     stamp_ns: int
 
@@ -65,6 +67,7 @@ class RoadRepair:
             list(stamps) == sorted(stamps)
             and repair.seen_ns <= repair.stamp_ns <= MAX_STAMP_NS
             and all(type(c_rr) is float and abs(c_rr) <= 1 for c_rr in (repair.before, repair.after))
+            and 0 < repair.cell_m < math.inf
             and len({*repair.blocks}) == len(repair.cells) <= MOST_BLOCKS
             and all(abs(place) < 2**31 for place in places)
             and all(len(bits) == DIGITS and len(bytes.fromhex(bits)) == DIGITS // 2 for *_, bits in repair.cells)

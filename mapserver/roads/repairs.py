@@ -186,7 +186,11 @@ class Strips:
             own = cells[one.segment] = cells.get(one.segment) or self._cells(one.segment)
             stamps = one.known_ns, one.first_ns, min(one.seen_ns, stamp_ns)
             if own:
-                out.append(RoadRepair(self._segments.ids[one.segment], *stamps, one.before, one.after, own, stamp_ns))
+                out.append(
+                    RoadRepair(
+                        self._segments.ids[one.segment], *stamps, one.before, one.after, self._cell_m, own, stamp_ns
+                    )
+                )
         return out
 
     def placed(self, repairs: Iterable[RoadRepair]) -> list[Repair]:

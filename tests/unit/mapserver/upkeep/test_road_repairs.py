@@ -257,22 +257,23 @@ def test_server_follower_restart_and_as_of_now_answer_alike(tmp_path_factory, co
         site.answers.roads.reach(site.writer.run(lambda store: store.merged))
         answers = [site.answers.answer(query) for query in QUESTIONS]
         assert answers == [follower_of(folder).answer(query) for query in QUESTIONS]
-        newest_ns = site.writer.run(lambda store: store.newest_ns)
-        np.testing.assert_array_equal(site.resistance(newest_ns), site.resistance())
         standing = site.writer.run(lambda store: store.facts.repairs.standing)
         site.starts_again()
         site.answers.roads.reach(1)
         assert answers == [site.answers.answer(query) for query in QUESTIONS]
         assert site.writer.run(lambda store: store.facts.repairs.standing) == standing
+        site.answers.examine_roads()
+        newest_ns = site.writer.run(lambda store: store.newest_ns)
+        np.testing.assert_array_equal(site.resistance(newest_ns), site.resistance())
 
 
 # --- events ----------------------------------------------------------------------------------------------------------
 
-REPAIR = RoadRepair("3_0_e", START_NS, START_NS + 1, START_NS + 2, 0.06, 0.02, ((1, -2, "0f" * 32),), START_NS + 3)
+REPAIR = RoadRepair("3_0_e", START_NS, START_NS + 1, START_NS + 2, 0.06, 0.02, 1.0, ((1, -2, "0f" * 32),), START_NS + 3)
 
 
 def hear(body: object) -> Decisions:
-    decisions = Decisions()
+    decisions = Decisions(1.0)
     decisions.hear([Event(1, KIND, 1, body)], "the journal")  # type: ignore[arg-type]
     return decisions
 
@@ -290,6 +291,7 @@ def test_an_event_is_read_as_it_was_written_and_withdrawn_by_its_key():
     gone = stands.repairs.after([replace(REPAIR, cells=())])
     assert (gone.standing, gone.ages) == ({}, {})
     assert gone.differing(stands.repairs) == {(1, -2)}
+    assert not hear({**REPAIR.body(), "cell_m": 0.5}).facts.repairs.standing, "on cells of another size"
 
 
 def test_a_repair_whose_passes_are_forgotten_stands_and_one_that_moved_a_little_is_the_same():
@@ -326,6 +328,8 @@ def test_a_repair_whose_passes_are_forgotten_stands_and_one_that_moved_a_little_
         {"cells": [[2**31, 2, "0f" * 32]]},
         {"cells": [["a", 2, "0f" * 32]]},
         {"cells": 7},
+        {"cell_m": 0.0},
+        {"cell_m": "1"},
         {"colour": "red"},
     ],
 )
