@@ -75,8 +75,9 @@ class RoadMap:
 
     @cached_property
     def changes(self) -> tuple[Repair, ...]:
-        """Repairs proved by then, newest first."""
-        proved = (repair for repair in self.facts.repairs.standing.values() if repair.seen_ns <= self.stamp_ns)
+        """Repairs proved by then, as long ago as traffic counts, newest first."""
+        first_ns, standing = self.stamp_ns - LOOK_BACK_NS, self.facts.repairs.standing
+        proved = (repair for repair in standing.values() if first_ns < repair.seen_ns <= self.stamp_ns)
         return tuple(sorted(self.strips.placed(proved), key=lambda one: (-one.seen_ns, one.segment, -one.first_ns)))
 
     @cached_property
@@ -197,9 +198,11 @@ class RoadMaps:
 
         Keeps roads new, but waits for nobody who makes them.
         """
+        if not self._source.run(lambda state: state.version.row):
+            return None
         newest, asked_s = self._newest, self._ask()
-        if not newest or asked_s - newest.looked_s >= newest.lasts_s:
-            if not self._source.run(lambda state: state.version.row) or not self._lock.acquire(blocking=False):
+        if not newest or asked_s - newest.looked_s >= max(FRESH_S, COSTLY * newest.took_s):
+            if not self._lock.acquire(blocking=False):
                 return None
             try:
                 with _journal_read():
@@ -210,10 +213,10 @@ class RoadMaps:
         if not newest or newest.roads is self._examined:
             return None
         self._examined = roads = newest.roads
-        standing = roads.facts.repairs
-        forgotten = [repair for repair in standing.standing.values() if repair.known_ns < newest.since_ns]
-        found, _ = repairs(since(newest.passes, roads.strips.placed(forgotten)))
-        events = standing.judged(roads.strips.located(found, roads.stamp_ns), newest.since_ns, roads.stamp_ns)
+        facts, since_ns = roads.facts.repairs, newest.since_ns
+        rootless = (one for one in facts.standing.values() if one.known_ns < since_ns <= one.first_ns)
+        found, _ = repairs(since(newest.passes, roads.strips.placed(rootless)))
+        events = facts.judged(roads.strips.located(found, roads.stamp_ns), since_ns, roads.stamp_ns)
         return (roads.version, events) if events else None
 
     def renew(self) -> float:
@@ -226,7 +229,7 @@ class RoadMaps:
         except QueryError as error:  # queries get the same answer
             log.info("no road map reason=%s problem=%r", error.reason, str(error))
         took_s = self._clock() - began_s
-        # rarely, because all layers near new samples are derived again; at most half of the time
+        # at most half of the time
         return max(max(FRESH_S, COSTLY * took_s) - SPARE * took_s, took_s)
 
     def _lately(self) -> RoadMap:
