@@ -215,8 +215,8 @@ class RoadMaps:
         self._examined = roads = newest.roads
         facts, since_ns = roads.facts.repairs, newest.since_ns
         rootless = (one for one in facts.standing.values() if one.known_ns < since_ns <= one.first_ns)
-        found, _ = repairs(since(newest.passes, roads.strips.placed(rootless)))
-        events = facts.judged(roads.strips.located(found, roads.stamp_ns), since_ns, roads.stamp_ns)
+        changes, _ = repairs(since(newest.passes, roads.strips.placed(rootless)))
+        events = facts.judged(roads.strips.located(changes, roads.stamp_ns), since_ns, roads.stamp_ns)
         return (roads.version, events) if events else None
 
     def renew(self) -> float:

@@ -109,8 +109,8 @@ class Repairs:
         both = self.ages.keys() | other.ages.keys()
         return {block for block in both if self.ages.get(block) is not other.ages.get(block)}
 
-    def judged(self, found: Iterable[RoadRepair], since_ns: int, stamp_ns: int) -> list[RoadRepair]:
-        """Events that lead to the repairs found at a site time [ns].
+    def judged(self, shown: Iterable[RoadRepair], since_ns: int, stamp_ns: int) -> list[RoadRepair]:
+        """Events that lead to the repairs shown at a site time [ns].
 
         since_ns: all passes since then were examined. Repairs that rest on earlier ones stand.
         """
@@ -118,7 +118,7 @@ class Repairs:
         for repair in self.standing.values():
             by_minute.setdefault(repair.first_ns // VISIT_NS, []).append(repair)
         kept, events = set[Key](), list[RoadRepair]()
-        for one in found:
+        for one in shown:
             minute = one.first_ns // VISIT_NS
             near = (repair for at in (minute, minute - 1, minute + 1) for repair in by_minute.get(at, ()))
             same = next((repair for repair in near if _is_same(repair, one) and repair.seen_ns <= stamp_ns), None)

@@ -222,7 +222,7 @@ def test_a_repair_is_told_and_counts(tmp_path):
         assert (row.since_ns, row.before, row.saved_kwh_ph) == (change.first_ns, change.before, change.saved_kwh_ph)
 
 
-def found(answers):
+def shown(answers):
     """What the newest roads show of repairs."""
     answers.roads.reach(answers.source.run(lambda state: state.version.row))
     answers.roads.read()
@@ -464,10 +464,10 @@ def test_a_fact_between_two_passes_is_no_repair(tmp_path, facts):
         answers = answers_of(opened)
         answers.examine_roads()
         opened.run(lambda store: setattr(store, "facts", facts))
-        assert found(answers) is None
+        assert shown(answers) is None
         first = {name: 1 + len(rows) for name, rows in parts[0].items()}
         send(opened, [incoming(rows, first[name], machine=name) for name, rows in parts[1].items()])
-        assert found(answers) is None
+        assert shown(answers) is None
         listed = worklist(answers)
         known = {one.id: one.resistance for one in segments(answers).segments}
     assert listed.changes == ()

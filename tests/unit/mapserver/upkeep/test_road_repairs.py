@@ -123,10 +123,10 @@ def test_a_repair_is_journalled_once_and_moves_no_grid(site: Site):
 
 def test_a_repair_that_rested_on_a_machine_goes_with_it_and_returns_with_it(site: Site, tmp_path: Path):
     site.answers.examine_roads()
-    found, read = site.events(), site.resistance()
+    shown, read = site.events(), site.resistance()
     site.decides(GONE)
     site.answers.examine_roads()
-    assert [event.cells for event in site.events()[len(found) :]] == [()] * len(found)
+    assert [event.cells for event in site.events()[len(shown) :]] == [()] * len(found)
     assert not site.writer.run(lambda store: store.facts.repairs.standing)
     with closing(Site(tmp_path / "alone")) as alone:
         send(alone.writer, [incoming(row.rows, machine="a", spool_id=row.row) for row in rows_of(site, "a")])
@@ -134,7 +134,7 @@ def test_a_repair_that_rested_on_a_machine_goes_with_it_and_returns_with_it(site
     site.decides(replace(GONE, trusted=True))
     site.answers.examine_roads()
     np.testing.assert_array_equal(site.resistance(), read)
-    assert {event.key for event in site.events()} == {event.key for event in found}
+    assert {event.key for event in site.events()} == {event.key for event in shown}
 
 
 def rows_of(site: Site, machine: str):
@@ -157,9 +157,9 @@ def test_samples_of_before_the_repair_that_come_late_do_not_count(site: Site):
 def test_a_decision_in_between_lets_nothing_be_written_that_was_found_before(site: Site):
     site.answers.roads.read()
     job = RoadRepairs(site.writer, site.answers.roads.repairs)
-    found = site.answers.roads.repairs()
-    assert found
-    stale = RoadRepairs(site.writer, lambda: found)
+    shown = site.answers.roads.repairs()
+    assert shown
+    stale = RoadRepairs(site.writer, lambda: shown)
     site.decides(GONE)
     stale.run()
     assert site.events() == []
@@ -186,16 +186,16 @@ def test_of_two_servers_in_a_take_over_one_journals_it(tmp_path: Path, database)
             for i, name in enumerate("ab"):
                 rows = passes(LINE, count, c_rr, seed=2 * spool + i, after_s=after_s + 30.0 * i)
                 send(first, [incoming(rows, machine=name, spool_id=1 + spool)])
-        found = answers_of(first).roads.repairs()
-        assert found
+        shown = answers_of(first).roads.repairs()
+        assert shown
         first.run(lambda store: store.journal._close_sessions())  # it hangs, and its lock is gone
         with closing(Writer(store_at(locations[1]))) as second:
             answers_of(second).examine_roads()
             events = second.run(lambda store: [event.body for event in store.journal.events(KIND)])
-            assert len(events) == len(found[1])
-            RoadRepairs(first, lambda: found).run()  # it hears of them first
+            assert len(events) == len(shown[1])
+            RoadRepairs(first, lambda: shown).run()  # it hears of them first
             with pytest.raises(FencedError):
-                first.run(lambda store: store.decide(*found[1]))
+                first.run(lambda store: store.decide(*shown[1]))
             answers_of(second).examine_roads()
             assert second.run(lambda store: [event.body for event in store.journal.events(KIND)]) == events
 
