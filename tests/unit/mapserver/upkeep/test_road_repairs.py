@@ -126,7 +126,7 @@ def test_a_repair_that_rested_on_a_machine_goes_with_it_and_returns_with_it(site
     shown, read = site.events(), site.resistance()
     site.decides(GONE)
     site.answers.examine_roads()
-    assert [event.cells for event in site.events()[len(shown) :]] == [()] * len(found)
+    assert [event.cells for event in site.events()[len(shown) :]] == [()] * len(shown)
     assert not site.writer.run(lambda store: store.facts.repairs.standing)
     with closing(Site(tmp_path / "alone")) as alone:
         send(alone.writer, [incoming(row.rows, machine="a", spool_id=row.row) for row in rows_of(site, "a")])
