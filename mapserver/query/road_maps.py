@@ -216,7 +216,10 @@ class RoadMaps:
         facts, since_ns = roads.facts.repairs, newest.since_ns
         rootless = (one for one in facts.standing.values() if one.known_ns < since_ns <= one.first_ns)
         changes, _ = repairs(since(newest.passes, roads.strips.placed(rootless)))
-        events = facts.judged(roads.strips.located(changes, roads.stamp_ns), since_ns, roads.stamp_ns)
+        shown = {(roads.segments.ids[one.segment], one.first_ns): one for one in changes}
+        proved = {key for key, one in facts.standing.items() if one.seen_ns <= roads.stamp_ns}
+        fresh = roads.strips.located((one for key, one in shown.items() if key not in proved), roads.stamp_ns)
+        events = facts.judged(fresh, shown.keys() & proved, since_ns, roads.stamp_ns)
         return (roads.version, events) if events else None
 
     def renew(self) -> float:

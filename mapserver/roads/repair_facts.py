@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -109,15 +109,15 @@ class Repairs:
         both = self.ages.keys() | other.ages.keys()
         return {block for block in both if self.ages.get(block) is not other.ages.get(block)}
 
-    def judged(self, shown: Iterable[RoadRepair], since_ns: int, stamp_ns: int) -> list[RoadRepair]:
-        """Events that lead to the repairs shown at a site time [ns].
+    def judged(self, shown: Iterable[RoadRepair], again: Set[Key], since_ns: int, stamp_ns: int) -> list[RoadRepair]:
+        """Events that lead to the repairs shown at a site time [ns], besides those that are shown again.
 
         since_ns: all passes since then were examined. Repairs that rest on earlier ones stand.
         """
         by_minute: dict[int, list[RoadRepair]] = {}
         for repair in self.standing.values():
             by_minute.setdefault(repair.first_ns // VISIT_NS, []).append(repair)
-        kept, events = set[Key](), list[RoadRepair]()
+        kept, events = set(again), list[RoadRepair]()
         for one in shown:
             minute = one.first_ns // VISIT_NS
             near = (repair for at in (minute, minute - 1, minute + 1) for repair in by_minute.get(at, ()))

@@ -300,11 +300,12 @@ def test_a_repair_whose_passes_are_forgotten_stands_and_one_that_moved_a_little_
         REPAIR, segment="3_0_e.1", first_ns=REPAIR.first_ns + 10**9, cells=((1, -2, "0f" * 20 + "00" * 12),)
     )
     stands = NO_REPAIRS.after([REPAIR])
-    assert stands.judged([moved], 0, REPAIR.stamp_ns) == []
-    assert stands.judged([], REPAIR.known_ns + 1, REPAIR.stamp_ns) == []
-    assert stands.judged([], REPAIR.known_ns, REPAIR.stamp_ns) == [replace(REPAIR, cells=())]
+    assert stands.judged([moved], set(), 0, REPAIR.stamp_ns) == []
+    assert stands.judged([], set(), REPAIR.known_ns + 1, REPAIR.stamp_ns) == []
+    assert stands.judged([], set(), REPAIR.known_ns, REPAIR.stamp_ns) == [replace(REPAIR, cells=())]
+    assert stands.judged([], {REPAIR.key}, REPAIR.known_ns, REPAIR.stamp_ns) == []
     far = replace(moved, cells=((1, -3, "0f" * 32),))
-    assert stands.judged([far], 0, REPAIR.stamp_ns) == [replace(REPAIR, cells=()), far]
+    assert stands.judged([far], set(), 0, REPAIR.stamp_ns) == [replace(REPAIR, cells=()), far]
 
 
 @pytest.mark.parametrize(
