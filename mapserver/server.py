@@ -27,7 +27,8 @@ from mapserver.past.past import StorePast
 from mapserver.query import road_maps, routes
 from mapserver.query.answering import Answers
 from mapserver.query.queryable import AnswerPool, MapQueryable, Replies, question
-from mapserver.query.server_source import CommandDesk, ServerSource
+from mapserver.query.road_maps import RoadMaps
+from mapserver.query.server_source import CommandDesk, ServerReading, ServerSource
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import ConfigError, QueryError, Refusal
 from protocol.queries.answer_codec import encode_change
@@ -90,9 +91,10 @@ class Server:
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
         past = StorePast.of_store(location.folder, site.cell_m, config.fold)
-        self._upkeep = Upkeep(self._writer, self._publish, past)
+        roads = RoadMaps(ServerReading(self._writer, past))
+        self._upkeep = Upkeep(self._writer, self._publish, past, roads.repairs)
         source = ServerSource(self._writer, self._upkeep, past)
-        self.answers = Answers(source)
+        self.answers = Answers(source, roads)
         self._replies, self._commands = Replies(source), CommandDesk(self._writer, self._upkeep, self.answers.info)
         self._pool = AnswerPool("command", COMMAND_THREADS, MOST_COMMANDS)
         self._queries = MapQueryable(readers, keys.map_queries_all(site.name), source, self.answers)

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapserver.ingest.decisions import calibrations
+from mapserver.ingest.decisions import ground_decisions
 from mapserver.ingest.map_info import lacking
 from mapserver.ingest.store_folder import hold_place, is_in_use
 from mapserver.journal import archived_decisions
@@ -49,7 +49,7 @@ def backup(store: Path, out: Path) -> BackupReport:
         with source.file_reader() as journal:
             journal.copy_to(part / JOURNAL_FILE)
         with JournalLocation(part).reader() as copied:  # rows that move to the archive from now on are in the copy
-            archived, decisions = copied.archived_row, calibrations(copied)
+            archived, decisions = copied.archived_row, ground_decisions(copied)
             identity = copied.identity().id
         _copy_archive(source, part, archived)
         if archived and decisions:
@@ -93,7 +93,7 @@ def _examined(location: JournalLocation, *, live: bool) -> BackupReport:
         journal.require_sound()
         journal.check()
         watermarks, events, last_row = journal.watermarks(), journal.events(), journal.last_row
-        calibrations(journal)
+        ground_decisions(journal)
         for some in read_history(History(journal, location.archive), until=last_row):
             rows += len(some)
             columns = (some.machine, some.spool_ids, some.first_seqs, some.lengths)

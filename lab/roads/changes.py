@@ -1,4 +1,4 @@
-"""Change detection as precision, recall, delay: of segments, cells, and cells read with `repairs`.
+"""Change detection as precision, recall, delay: of segments, and of cells without and with repairs of roads.
 
 The map is read every STEP_S while samples arrive by stamp, so delays measure evidence, not links.
 """
@@ -16,15 +16,16 @@ from lab.calibration.drives import Scene
 from lab.campaign.true_maps import window_of
 from lab.ground.truth import true_ground
 from lab.roads.drives import RoadDrive
-from lab.roads.repairs import UNTOUCHED, SegmentRepairs
+from lab.roads.repairs import UNTOUCHED, SegmentRepairs, ages
 from lab.roads.score import Recorded, TrueTrack
-from mapserver.change.validity import Ages, Pages, valid_pages
+from mapserver.change.validity import Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import VISIT_NS, FoldConfig, name_hash
 from mapserver.evidence.grid import Grid
+from mapserver.evidence.timeline import Ages
 from mapserver.query.views import place, read_cells, view_of
 from mapserver.roads.passes import MINUTE_NS
-from mapserver.roads.repairs import ages
+from mapserver.roads.repairs import Strips
 from mapserver.roads.segments import SegmentTable
 from protocol.arrays import Bools, Ints
 from protocol.site.geometry import CellWindow
@@ -111,7 +112,7 @@ class ChangedGround:
 
 
 def changes(recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs, ground: ChangedGround) -> list[Changes]:
-    """Changes of segments, of cells as read by default, and of cells with `repairs`."""
+    """Changes of segments, of cells alone, and of cells as the map reads them, with repairs."""
     half_ns, window = recorded.half_ns, ground.window
     shape = (window.rows, window.columns)
     far = cv2.dilate(ground.changed.astype(np.uint8), np.ones((2 * ALARM_CELLS + 1,) * 2, np.uint8)) == 0
@@ -134,7 +135,7 @@ def maps_of_changes(
     recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs, window: CellWindow, grid: Grid
 ) -> Iterator[tuple[int, dict[str, Bools]]]:
     """Fold a recording; every STEP_S yields a stamp and the cells (rows, columns) reported as changed."""
-    config = ServerConfig()
+    config, strips = ServerConfig(), Strips(whole, CELL_M)
     rows = np.concatenate(list(recorded.rows.values()))
     hashes = np.array([name_hash(name) for name in recorded.rows], np.uint64)
     names = np.repeat(hashes, [len(table) for table in recorded.rows.values()])
@@ -146,7 +147,7 @@ def maps_of_changes(
         grid.fold_all(rows[done:end], names[done:end])
         done = end
         pages = view_of(grid, window, config).pages
-        known = {CELLS: {}, CELLS_REPAIRS: ages(whole, [one for one in seen.shown if one.seen_ns <= now_ns], CELL_M)}
+        known = {CELLS: {}, CELLS_REPAIRS: ages(strips, [one for one in seen.shown if one.seen_ns <= now_ns])}
         yield now_ns, {kind: _said(pages, window, since, config) for kind, since in known.items()}
 
 

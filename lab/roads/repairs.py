@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,14 +11,17 @@ from scipy.spatial import cKDTree
 from lab.roads.score import TARGET, Recorded, TrueTraffic, grid_of, tally_of, true_passes, true_traffic
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import name_hash
+from mapserver.evidence.timeline import Ages
 from mapserver.query.views import read_cells, view_of
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.loss import losses
 from mapserver.roads.passes import MINUTE_NS, PassTally
-from mapserver.roads.repairs import Repair, ages, repairs
+from mapserver.roads.repair_facts import NO_REPAIRS
+from mapserver.roads.repairs import Repair, Strips, repairs
 from mapserver.roads.segments import SegmentTable
 from mapserver.roads.tally import Tally
 from protocol.arrays import Floats, Ints
+from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 CHANGED = (1.5, 4.0)  # judged factors of c_rr
@@ -67,29 +70,29 @@ class SegmentRepairs:
         half_ns, tracks = recorded.half_ns, tuple(recorded.tracks.values())
         before, after = (true_traffic(tracks, ledgers, TARGET, *half) for half in ((0, half_ns), (half_ns, 2**62)))
         factor = np.maximum(before.c_rr / after.c_rr, after.c_rr / before.c_rr)
-        first_minute = half_ns // MINUTE_NS - 1
-        seen_by = {each.segment: each.seen for each in reversed(shown) if each.minute >= first_minute}
+        first_ns = (half_ns // MINUTE_NS - 1) * MINUTE_NS
+        seen_by = {each.segment: each.seen_ns for each in reversed(shown) if each.first_ns >= first_ns}
         names = sorted(recorded.rows, key=name_hash)  # in the order of their numbers
         true = []
         for segment in np.flatnonzero((factor >= CHANGED[0]) & (factor <= CHANGED[1])).tolist():
             later = {name: true_passes(track, ledgers, segment, half_ns) for name, track in recorded.tracks.items()}
             seen = seen_by.get(segment)
-            last = (passes.segment == segment) & (passes.minute == (-1 if seen is None else seen))
+            last = (passes.segment == segment) & ((passes.minute + 1) * MINUTE_NS == (-1 if seen is None else seen))
             stamps = np.sort(np.concatenate(list(later.values())))
             true.append(TrueRepair(segment, stamps, shown_at(later, [names[i] for i in passes.machine[last]], seen)))
-        false = [each for each in shown if factor[each.segment] < UNTOUCHED or each.minute < first_minute]
+        false = [each for each in shown if factor[each.segment] < UNTOUCHED or each.first_ns < first_ns]
         return cls(shown, false, looks, true, (before, after))
 
 
-def shown_at(later: Mapping[str, Ints], machines: Collection[str], seen: int | None) -> int | None:
-    """End of the true pass that revealed a change in minute `seen` by one of these machines, else the minute's end.
+def shown_at(later: Mapping[str, Ints], machines: Collection[str], seen_ns: int | None) -> int | None:
+    """End of the true pass by one of these machines that proved a change in the minute before seen_ns, or that.
 
     later: each machine's pass stamps after the change.
     """
-    if seen is None:
+    if seen_ns is None:
         return None
-    ends_ns = [stamp for name in machines for stamp in later[name].tolist() if stamp >= seen * MINUTE_NS]
-    return min(ends_ns, default=(seen + 1) * MINUTE_NS)
+    ends_ns = [stamp for name in machines for stamp in later[name].tolist() if stamp >= seen_ns - MINUTE_NS]
+    return min(ends_ns, default=seen_ns)
 
 
 def repair_figures(recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs) -> dict[str, float]:
@@ -120,8 +123,8 @@ def _cells_shown(
     changed: read by changes of cells only; since: also by those of segments.
     """
     grid, config = grid_of(recorded.rows), ServerConfig()
-    everything = [Repair(segment, 1, 1, 0.0, 0.0) for segment in judged]
-    blocks = ages(whole, everything, 1.0)
+    strips = Strips(whole, 1.0)
+    blocks = ages(strips, [Repair(segment, 1, 1, 1, 0.0, 0.0) for segment in judged])
     out = {"cells": 0.0, "cells_changed": 0.0, "cells_since": 0.0}
     if not blocks:
         return out
@@ -133,7 +136,7 @@ def _cells_shown(
     middles = np.concatenate([whole.line(i) for i in judged])
     owner = np.repeat(judged, [len(whole.line(i)) for i in judged])
     own = owner[cKDTree(middles).query(places + 0.5)[1]]
-    for name, known in (("cells_changed", {}), ("cells_since", ages(whole, shown, 1.0))):
+    for name, known in (("cells_changed", {}), ("cells_since", ages(strips, shown))):
         view = replace(view_of(grid, window, config), ages=known)
         c_rr = read_cells(view, window, ("resistance",), 1.0, config)["resistance"]
         values = c_rr[places[:, 1] - bottom, places[:, 0] - left].astype(np.float64)
@@ -141,3 +144,8 @@ def _cells_shown(
         out[name] = float((np.abs(values - after) < np.abs(values - before)).sum())
         out["cells"] = float(np.isfinite(values).sum())
     return out
+
+
+def ages(strips: Strips, changes: Iterable[Repair]) -> Ages:
+    """Ages of cells once these changes are journalled."""
+    return NO_REPAIRS.after(strips.located(changes, MAX_STAMP_NS)).ages

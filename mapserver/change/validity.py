@@ -19,12 +19,11 @@ from mapserver.change.detection import (
     known,
     reach_blocks,
 )
-from mapserver.evidence.timeline import Block, TimedPages
+from mapserver.evidence.timeline import Ages, Block, TimedPages
 from protocol.arrays import AnyArray, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
 Pages = Mapping[Block, TimedPages]
-Ages = Mapping[Block, Ints]  # start [ns] of the present ground of cells (256,), 0 for ever; only blocks with any
 T = TypeVar("T")
 
 

@@ -129,8 +129,16 @@ class Grid:
         self._drain()
         return [self._touched.pop() for _ in range(min(most, len(self._touched)))]
 
+    def renew(self, blocks: Iterable[Block]) -> None:
+        """Have readers derive blocks again, as after a fold: their evidence is read otherwise."""
+        self._drain()
+        self._turn += 1
+        for block in blocks:
+            if timeline := self._timelines.get(block):
+                timeline.turn = self._turn
+
     def folded_since(self, turn: int) -> tuple[list[Block], int]:
-        """Blocks folded after a turn (-1: all), and the present turn."""
+        """Blocks folded or renewed after a turn (-1: all), and the present turn."""
         self._drain()
         return [block for block, timeline in self._timelines.items() if timeline.turn > turn], self._turn
 
@@ -139,7 +147,7 @@ class Grid:
         return evidence(self.pages(blocks))
 
     def last_turns(self, blocks: Iterable[Block]) -> list[int]:
-        """The last turn in which each block was folded, -1 for none."""
+        """The last turn in which each block was folded or renewed, -1 for none."""
         self._drain()
         timelines = (self._timelines.get(block) for block in blocks)
         return [timeline.turn if timeline else -1 for timeline in timelines]

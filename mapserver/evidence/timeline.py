@@ -7,7 +7,7 @@ samples. Hence it can be settled late and merged.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,7 @@ from protocol.arrays import Ints
 
 PATIENCE = 24  # waiting pages before a timeline is settled: fewer cost time, more memory
 Block = tuple[int, int]  # column and row
+Ages = Mapping[Block, Ints]  # start [ns] of the present ground of cells (256,), 0 for ever; only blocks with any
 
 
 @dataclass(frozen=True, slots=True)

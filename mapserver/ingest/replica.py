@@ -28,7 +28,7 @@ class Replica:
         self.grid, self.facts = Grid(site.cell_m, config.fold), Facts()
         self.merged = 0
         self.changes: dict[int, GroundChange] = {}
-        self._decisions = Decisions()
+        self._decisions = Decisions(site.cell_m)
         self._newest_ns: dict[str, int] = {}
 
     @property
@@ -60,7 +60,8 @@ class Replica:
                 self.changes[change.id] = change
         self.tail.heard(events)
         if self.wanted == self.facts:
-            self.facts = self.wanted  # with a higher number
+            self.grid.renew(self.facts.repairs.differing(self.wanted.repairs))
+            self.facts = self.wanted  # with a higher number, and other repairs
 
     def fold(self, rows: JournalRows) -> None:
         """Fold the next rows."""

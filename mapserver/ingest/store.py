@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +30,7 @@ from mapserver.journal.rows import Admission, Selection
 from mapserver.past.checkpoint_file import OPEN_END_NS
 from mapserver.past.checkpoints import remove_beyond, save_snapshot, snapshot_rows
 from mapserver.past.past import StorePast
+from mapserver.roads.repair_facts import RoadRepair
 from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
@@ -78,7 +79,7 @@ class Store:
             self.history = History(self.journal, location.archive)
             self.identity = self.journal.identity()
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
-            self._decisions, last_row = Decisions.of_journal(self.journal), self.journal.last_row
+            self._decisions, last_row = Decisions.of_journal(self.journal, site.cell_m), self.journal.last_row
             self.facts = facts = self._decisions.facts
             self.shortfalls = name_shortfalls(self.journal, snapshot_rows(folder))
             remove_beyond(folder, self.journal.trusted_row)
@@ -187,6 +188,16 @@ class Store:
         self._decisions.add(decisions, self.journal.append_events(map(plain, decisions)))
         self._count_decisions()
         return self._decisions.facts
+
+    def repair(self, version: MapVersion, events: Sequence[RoadRepair]) -> bool:
+        """Store repairs found in a version of the map, and withdrawals; False if it has other facts by now."""
+        self._decisions.hear(self.journal.events(after=self.decided), self.journal.where)  # answers may get lost
+        self._count_decisions()
+        known = (self.identity.id, self.fact, self.decided) == (version.store, version.fact, version.fact)
+        if known and version.row <= self.merged:
+            self.decide(*events)
+            return True
+        return False
 
     def confirm(self, confirmed: Mapping[str, int]) -> None:
         """Date offers to machines: the solver confirms them, as of when [ns]."""
@@ -310,6 +321,7 @@ class Store:
             self.merged = self.journal.last_row
 
     def _count_decisions(self) -> None:
-        """Adopt the number of decisions that lead to the grid's facts."""
+        """Adopt number and repairs of decisions that lead to the grid's facts."""
         if self._decisions.facts == self.facts:
+            self.grid.renew(self.facts.repairs.differing(self._decisions.facts.repairs))
             self.facts = self._decisions.facts

@@ -1,4 +1,4 @@
-"""Calibration decisions beside archive files, so that folding these gives the server's map.
+"""Decisions about samples and roads beside archive files, so that folding these gives the server's map.
 
 Replaced as a whole; the journal has the same decisions as events and is the truth.
 """
@@ -14,15 +14,19 @@ from typing import Any
 from mapserver.calibration.decision import CalibrationDecision
 from mapserver.journal.archive import READABLE
 from mapserver.journal.places import FilePlace
+from mapserver.roads.repair_facts import RoadRepair
 from protocol.errors import StoreError
 from protocol.files import write_whole
 
-FILE = "calibration.json"  # file name in an archive's folder
+FILE = "decisions.json"  # file name in an archive's folder
 
 
-def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> None:
+def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision | RoadRepair]) -> None:
     """Write a store's decisions, in order; raises StoreError."""
-    table = {"store": store, "decisions": [decision.body() for decision in decisions]}
+    bodies: dict[str, list[Any]] = {"calibrations": [], "repairs": []}
+    for decision in decisions:
+        bodies["repairs" if isinstance(decision, RoadRepair) else "calibrations"].append(decision.body())
+    table = {"store": store, **bodies}
     text = json.dumps({**table, "crc32": _checksum(table)}, separators=(",", ":"))
     try:
         write_whole(folder / FILE, f"{text}\n".encode(), READABLE)
@@ -30,7 +34,7 @@ def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> 
         raise StoreError(folder / FILE, f"cannot be written: {error.strerror}") from None
 
 
-def load(folder: Path | FilePlace) -> list[CalibrationDecision]:
+def load(folder: Path | FilePlace) -> list[CalibrationDecision | RoadRepair]:
     """Read what `save` wrote, empty without a file; StoreError for damage or foreign content."""
     path = folder / FILE
     try:
@@ -40,10 +44,11 @@ def load(folder: Path | FilePlace) -> list[CalibrationDecision]:
     except (OSError, ValueError, RecursionError) as error:
         raise StoreError(path, f"cannot be read: {error}") from None
     if not isinstance(table, dict) or table.pop("crc32", None) != _checksum(table):
-        problem = "is damaged; restore it from a backup, or remove it: the map is made without corrections then"
+        problem = "is damaged; restore it from a backup, or remove it: the map is made without these decisions then"
         raise StoreError(path, problem)
     try:
-        return [CalibrationDecision.from_body(body) for body in table["decisions"]]
+        calibrations = map(CalibrationDecision.from_body, table["calibrations"])
+        return [*calibrations, *map(RoadRepair.from_body, table["repairs"])]
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise StoreError(path, f"{error}; remove it, if nobody has a better one") from None
 

@@ -28,7 +28,6 @@ from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource, MapState
 from mapserver.query.views import (
     PastMaps,
-    StillMap,
     View,
     bounds_of,
     check_blocks,
@@ -72,7 +71,7 @@ from protocol.queries.requests import (
     WhyQuery,
 )
 from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery
-from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
+from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import MAX_CELLS, Bounds, CellWindow, GridGeometry
 
 # of a search: a quarter of the budget
@@ -86,14 +85,15 @@ WITHOUT_DIFFERENCE = ("heading",)  # axes, which are periodic in half a turn
 class Answers:
     """Answers the queries of one map. Thread-safe."""
 
-    def __init__(self, source: MapSource) -> None:
+    def __init__(self, source: MapSource, roads_of_map: RoadMaps | None = None) -> None:
+        """roads_of_map: if others read them too."""
         self._source = source
         self._site, self._config = source.site, source.config
         self._layers = BlockLayers(self._site.cell_m, self._config)
         self._routes = Routes(source, self._layers, self._look_at_squares)
         self._open = OpenRegions()
-        self._roads = RoadMaps(source)
-        self._tiles = Tiles(source, self._layers, self._roads.lately)
+        self._roads = roads_of_map or RoadMaps(source)
+        self._tiles = Tiles(source, self._layers)
         self._past_tiles: TilesAnswer | None = None  # the last ones, which readers fetch in pieces
         self._answers: dict[type[MapQuery[Any]], Callable[[Any], Any]] = {
             PointQuery: self.point,
@@ -147,7 +147,7 @@ class Answers:
     def answer(self, query: MapQuery[Any]) -> bytes:
         """Answer one query; QueryError if it is wrong."""
         check_on_site(query, self._site, lambda: self._source.run(lambda state: state.grid.bounds()))
-        if query.after and _reads_roads(query):
+        if query.after and isinstance(query, RoadQuery) and query.as_of_ns is None:
             self._roads.reach(query.after)
         return query.encode(self._answers[type(query)](query))
 
@@ -194,9 +194,7 @@ class Answers:
     def _at(self, places: Floats, names: tuple[str, ...], query: Compared[Any]) -> PointsAnswer:
         """Layers of the cells at places (n, 2), minus those of another time if the query asks for it."""
         cells = self._site.geometry.cell_of(places)
-        (layers, version, stamp_ns), *others = (
-            self._layers_at(cells, names, as_of_ns, repairs=query.repairs) for as_of_ns in query.times
-        )
+        (layers, version, stamp_ns), *others = (self._layers_at(cells, names, as_of_ns) for as_of_ns in query.times)
         for older, its_version, _ in others:
             layers = {name: values - older[name] for name, values in layers.items()}
             version = replace(version, row=min(version.row, its_version.row))
@@ -254,9 +252,7 @@ class Answers:
     def why(self, query: WhyQuery) -> CellReasons:
         """All that is known of a cell."""
         window = self._cell(query.x_m, query.y_m)
-        if query.repairs:
-            view = self._roads.view(window, self._reach, query.as_of_ns)
-        elif query.as_of_ns is None:
+        if query.as_of_ns is None:
             view = self._source.run(lambda state: view_now(state, window))
         else:
             version, facts = self._source.run(lambda state: (state.version, state.facts))
@@ -319,24 +315,21 @@ class Answers:
         version, facts = self._source.run(lambda state: (state.version, state.facts))
 
         def source(as_of_ns: int | None) -> LookAt:
-            if as_of_ns is None or query.repairs:
-                look = self._look(window, names, as_of_ns, repairs=query.repairs)
+            if as_of_ns is None:
+                look = self._source.run(lambda state: self._layers.look(state, window, names))
                 return lambda _: look
             return lambda piece: self._look_back(piece, names, as_of_ns, facts, version)
 
         return tuple(map(source, query.times))
 
     def _layers_at(
-        self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
+        self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None
     ) -> tuple[dict[str, Floats32], MapVersion, int]:
         """Layers (n,) of cells (n, 2) [column, row], their map's version and time."""
         if as_of_ns is None:
-            look = self._now(lambda state: self._layers.look_cells(state, cells, names), repairs=repairs)
+            look = self._source.run(lambda state: self._layers.look_cells(state, cells, names))
             return self._layers.at_cells(look, cells, names), look.version, look.stamp_ns
         window = _around(cells)
-        if repairs:
-            look = self._look(window, names, as_of_ns, repairs=True)
-            return self._layers.at_cells(look, cells, names), look.version, look.stamp_ns
         version, facts, parts = self._source.run(lambda state: (state.version, state.facts, parts_of(state, window)))
         out: dict[str, Floats32] = {name: np.full(len(cells), np.nan, np.float32) for name in names}
         for part in parts:
@@ -347,37 +340,20 @@ class Answers:
                     out[name][inside] = values
         return out, version, as_of_ns
 
-    def _look_at_squares(
-        self, squares: Set[Block], names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
-    ) -> Look:
+    def _look_at_squares(self, squares: Set[Block], names: tuple[str, ...], as_of_ns: int | None) -> Look:
         """Sources of area layers in squares."""
         if as_of_ns is None:
-            return self._now(lambda state: self._layers.look_squares(state, squares, names), repairs=repairs)
-        return self._look(around_squares(squares), names, as_of_ns, repairs=repairs)
-
-    def _look(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool) -> Look:
-        if as_of_ns is None:
-            return self._now(lambda state: self._layers.look(state, window, names), repairs=repairs)
-        if repairs:
-            return self._layers.look_at(self._roads.view(self._wide(window, names), self._reach, as_of_ns))
+            return self._source.run(lambda state: self._layers.look_squares(state, squares, names))
         version, facts = self._source.run(lambda state: (state.version, state.facts))
-        return self._look_back(window, names, as_of_ns, facts, version)
+        return self._look_back(around_squares(squares), names, as_of_ns, facts, version)
 
     def _look_back(
         self, window: CellWindow, names: tuple[str, ...], as_of_ns: int, facts: Facts, version: MapVersion
     ) -> Look:
         """Sources of a window as of a time; refuses too much."""
-        wide = self._wide(window, names)
+        wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
         self._source.run(lambda state: check_past(state, wide, self._reach))
         return self._layers.look_at(self._past.view(wide, as_of_ns, facts, version))
-
-    def _wide(self, window: CellWindow, names: tuple[str, ...]) -> CellWindow:
-        """With the cells around that layers depend on."""
-        return widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
-
-    def _now(self, look: Callable[[MapState | StillMap], Look], *, repairs: bool) -> Look:
-        """Look at the present map; repairs: at that of the newest roads, with their ages."""
-        return look(self._roads.read().still) if repairs else self._source.run(look)
 
     def _piece(self, reading: RegionReading, pieces: PieceGrid, number: int, cursor: int) -> Region:
         return replace(self._read(reading, pieces.piece(number)), piece=pieces.place(number, cursor))
@@ -443,16 +419,6 @@ def _is_in(cells: Ints, window: CellWindow) -> Bools:
 def _names_in(state: MapState) -> list[str]:
     """Machines in the map."""
     return [name for name in state.machines() if name not in state.facts.excluded]
-
-
-def _reads_roads(query: MapQuery[Any]) -> bool:
-    """Whether an answer depends on present roads."""
-    match query:
-        case RoadQuery():
-            return query.as_of_ns is None
-        case LineQuery() | Compared():
-            return query.repairs and query.as_of_ns is None
-    return False
 
 
 def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -4,16 +4,14 @@ Cell layers depend on the pages of their block and of those around, because chan
 layers also on cells around. The grid knows each block's last turn, so blocks without new evidence nearby are read from
 the cache. The validity of neighbouring pages is checked on every read, but rarely changes: a block is recomputed only
 if its own pages, or their validity, changed, a square only if a block was. Area layers are computed by square, hence
-the same for any window, bit for bit. On changed roads layers also depend on ages; other blocks are shared by reads with
-and without.
+the same for any window, bit for bit. Ages of repaired roads count as evidence: a new one begins a turn of its blocks.
 """
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import count, product
 from typing import NamedTuple
@@ -23,14 +21,14 @@ import cv2
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import Ages, Pages, around, valid_pages
+from mapserver.change.validity import Pages, around, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
-from mapserver.evidence.timeline import Block, evidence
+from mapserver.evidence.timeline import Ages, Block, evidence
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.source import MapState
-from mapserver.query.views import StillGrid, StillMap, View, check_blocks, place
+from mapserver.query.views import View, check_blocks, place
 from protocol.arrays import AnyArray, Floats, Floats32, Ints
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -44,19 +42,16 @@ NEVER = -1  # turn of a block without evidence
 # layers that follow from cached stamps and the site's now
 TIMED = {"age_s": "newest_ns", "changed_s": "changed_ns"}
 Layers = Mapping[str, AnyArray]  # (256,) each, or of a square
-# Dependencies of layers: last turn of all blocks they depend on, and ages there.
-State = tuple[int, bytes]
-NO_AGES = b""
 
 
 class Kept(NamedTuple):
-    """Layers of a block or square, and the state in which they are valid.
+    """Layers of a block or square, and the last turn of all blocks they depend on.
 
     origin: of a block, its last turn and first valid pages (256,), if not all; of a square, the numbers of its blocks.
     number: identifies an origin.
     """
 
-    state: State
+    turn: int
     layers: Layers
     origin: tuple[object, ...]
     number: int = NEVER
@@ -66,16 +61,16 @@ class Kept(NamedTuple):
 class Look:
     """Sources of a window's layers in one map version: cached layers, and pages of the rest.
 
-    cells, areas: cached, in these states or older; cell_states, area_states: of blocks with evidence, and squares near
-    any. turns: of blocks alone. pages: of blocks without valid layers, and around. ages: as in View.
+    cells, areas: cached, of these turns or older; cell_turns, area_turns: as in Kept, of blocks with evidence, and of
+    squares near any. turns: of blocks alone. pages: of blocks without valid layers, and around. ages: as in View.
     """
 
     version: MapVersion
     stamp_ns: int
     cells: Mapping[Block, Kept]
     areas: Mapping[Block, Kept]
-    cell_states: Mapping[Block, State]
-    area_states: Mapping[Block, State]
+    cell_turns: Mapping[Block, int]
+    area_turns: Mapping[Block, int]
     turns: Mapping[Block, int]
     pages: Pages
     grid: ReferenceType[Grid] | None = None
@@ -97,7 +92,7 @@ class BlockLayers:
         self._numbers = count()
         self.used, self.derived = 0, 0  # blocks and squares from the cache, and derived ones
 
-    def look(self, state: MapState | StillMap, window: CellWindow, names: Sequence[str]) -> Look:
+    def look(self, state: MapState, window: CellWindow, names: Sequence[str]) -> Look:
         """Sources of these layers of a window."""
         area_names, inner = _areas_of(names), _blocks_of(window)
         return self._look(state, inner, _stored(names), squares_of(window) if area_names else set(), area_names)
@@ -109,7 +104,7 @@ class BlockLayers:
         turn = max(state.grid.last_turns(around(block, self._reach)))
         with self._lock:
             kept = self._cells.get(block) if self._grid and self._grid() is state.grid else None
-            if kept is None or kept.state != (turn, NO_AGES) or any(TIMED.get(n, n) not in kept.layers for n in names):
+            if kept is None or kept.turn != turn or any(TIMED.get(n, n) not in kept.layers for n in names):
                 return None
             self._cells.move_to_end(block)
             self.used += 1
@@ -117,15 +112,15 @@ class BlockLayers:
         now_ns = state.newest_ns
         return {name: float(np.float32(_at(kept.layers, name, now_ns)[at])) for name in names}
 
-    def look_squares(self, state: MapState | StillMap, squares: Set[Block], names: Sequence[str]) -> Look:
+    def look_squares(self, state: MapState, squares: Set[Block], names: Sequence[str]) -> Look:
         """Sources of area layers in squares."""
         return self._look(state, _blocks_of(around_squares(squares)), (), squares, tuple(names))
 
-    def look_cells(self, state: MapState | StillMap, cells: Ints, names: Sequence[str]) -> Look:
+    def look_cells(self, state: MapState, cells: Ints, names: Sequence[str]) -> Look:
         """Sources of these layers of cells (n, 2) [column, row]."""
         return self.look_blocks(state, _blocks_with(cells), names)
 
-    def look_blocks(self, state: MapState | StillMap, blocks: Set[Block], names: Sequence[str]) -> Look:
+    def look_blocks(self, state: MapState, blocks: Set[Block], names: Sequence[str]) -> Look:
         """Sources of these layers of blocks, and of area layers in their squares."""
         area_names = _areas_of(names)
         squares = {(x // SQUARE, y // SQUARE) for x, y in blocks} if area_names else set[Block]()
@@ -133,7 +128,7 @@ class BlockLayers:
 
     def _look(
         self,
-        state: MapState | StillMap,
+        state: MapState,
         inner: Rect,
         cell_names: tuple[str, ...],
         squares: Set[Block],
@@ -142,8 +137,7 @@ class BlockLayers:
     ) -> Look:
         """Cell layers in a rectangle of blocks, or in some; area layers in squares that touch it."""
         grid, margin = state.grid, self._margin(area_names)
-        ages = state.ages if isinstance(state, StillMap) else {}
-        owner = grid.grid if isinstance(grid, StillGrid) else ref(grid)
+        ages, owner = state.facts.repairs.ages, ref(grid)
         whole = _of_squares(_squares_of(inner)) if squares else inner
         wide = _grown(whole, margin + self._reach)
         blocks = grid.blocks_in(_cells_of(wide))
@@ -153,44 +147,37 @@ class BlockLayers:
         check_blocks(work, "ask for less ground, or for fewer places, at once")
         own = dict(zip(blocks, grid.last_turns(blocks), strict=True))
         cell_turns, area_turns = _newest(own, wide, self._reach, margin, squares)
-        if isinstance(state, StillMap) and ages:
-            cell_states = _marked(cell_turns, state, None, lambda block: [block])
-            area_states = _marked(area_turns, state, margin, lambda square: self._around([square], area_names))
-        else:
-            cell_states, area_states = _unmarked(cell_turns), _unmarked(area_turns)
         with self._lock:
             if self._grid is None or self._grid() is not owner():  # a fact, or lost rows, replace the grid
                 self._cells.clear()
                 self._areas.clear()
                 self._grid, self._count = owner, 0
-            areas = _valid(self._areas, area_states, area_names)
-            stale = area_states.keys() - areas.keys()
+            areas = _valid(self._areas, area_turns, area_names)
+            stale = area_turns.keys() - areas.keys()
             areas |= _some(self._areas, stale)
             needed = self._around(stale, area_names)
             needed_names = (*cell_names, *(cell_layers.required(area_names) if needed else ()))
-            asked = only if only is not None else _within(cell_states, inner).keys() if cell_names else set[Block]()
-            wanted = {block: state for block, state in cell_states.items() if block in needed or block in asked}
+            asked = only if only is not None else _within(cell_turns, inner).keys() if cell_names else set[Block]()
+            wanted = {block: turn for block, turn in cell_turns.items() if block in needed or block in asked}
             cells = _valid(self._cells, wanted, needed_names)
             missing = wanted.keys() - cells.keys()
             cells |= _some(self._cells, missing)
         near = _near(own, missing, wide, self._reach)
         pages = dict(zip(near, grid.pages(near), strict=True))
-        return Look(state.version, state.newest_ns, cells, areas, cell_states, area_states, own, pages, owner, ages)
+        return Look(state.version, state.newest_ns, cells, areas, cell_turns, area_turns, own, pages, owner, ages)
 
     def look_at(self, view: View) -> Look:
         """Sources of a past map, without cache."""
-        state: State = 0, NO_AGES
-        states = {block: state for block, pages in view.pages.items() if pages}
-        near = {one for block in states for one in around(block, self._margin(tuple(AREA_LAYERS)))}
-        squares = dict.fromkeys({(x // SQUARE, y // SQUARE) for x, y in near}, state)
-        turns = dict.fromkeys(states, 0)
-        return Look(view.version, view.stamp_ns, {}, {}, states, squares, turns, view.pages, ages=view.ages)
+        turns = {block: 0 for block, pages in view.pages.items() if pages}
+        near = {one for block in turns for one in around(block, self._margin(tuple(AREA_LAYERS)))}
+        squares = dict.fromkeys({(x // SQUARE, y // SQUARE) for x, y in near}, 0)
+        return Look(view.version, view.stamp_ns, {}, {}, turns, squares, turns, view.pages, ages=view.ages)
 
     def read(self, look: Look, window: CellWindow, names: Sequence[str]) -> dict[str, Floats32]:
         """Layers (rows, columns) of a window inside the look's."""
         cell_names, area_names, inner = _stored(names), _areas_of(names), _blocks_of(window)
         areas = self.squares(look, squares_of(window), area_names) if area_names else {}
-        blocks = _within(look.cell_states, inner) if cell_names else ()
+        blocks = _within(look.cell_turns, inner) if cell_names else ()
         cells = self.blocks(look, blocks, cell_names)
         out: dict[str, Floats32] = {name: np.full((window.rows, window.columns), np.nan, np.float32) for name in names}
         for square, layers in areas.items():
@@ -234,7 +221,7 @@ class BlockLayers:
 
     def squares(self, look: Look, squares: Set[Block], names: Sequence[str]) -> dict[Block, Layers]:
         """Layers (SQUARE_CELLS, SQUARE_CELLS) of squares with evidence nearby."""
-        wanted = {square: state for square, state in look.area_states.items() if square in squares}
+        wanted = {square: turn for square, turn in look.area_turns.items() if square in squares}
         areas = _valid(look.areas, wanted, names)
         stale = sorted(wanted.keys() - areas.keys())
         made, derived = dict[Block, Kept](), 0
@@ -262,7 +249,7 @@ class BlockLayers:
 
     def blocks(self, look: Look, asked: Iterable[Block], names: Sequence[str]) -> dict[Block, Kept]:
         """Cell layers of blocks with evidence, cached or derived."""
-        blocks = {block: look.cell_states[block] for block in asked if block in look.cell_states}
+        blocks = {block: look.cell_turns[block] for block in asked if block in look.cell_turns}
         known = _some(look.cells, blocks)
         with self._lock:
             if look.grid is not None and look.grid is self._grid:  # cached meanwhile, by other queries or pieces
@@ -276,7 +263,7 @@ class BlockLayers:
         for block in missing:
             old, origin = known.get(block), (look.turns[block], *_beginning(first[block]))
             same = old if old and old.origin == origin else Kept(blocks[block], {}, origin, next(self._numbers))
-            made[block] = same._replace(state=blocks[block])
+            made[block] = same._replace(turn=blocks[block])
         lacking = [block for block in missing if any(name not in made[block].layers for name in names)]
         for some in chunks(lacking):
             sums = evidence([look.pages[block] for block in some], [first[block] for block in some])
@@ -321,9 +308,9 @@ class BlockLayers:
                 return
             for block, kept in made.items():
                 old = store.get(block)
-                if old and old.state[0] > kept.state[0]:
+                if old and old.turn > kept.turn:
                     continue
-                layers = {**old.layers, **kept.layers} if old and old.state == kept.state else kept.layers
+                layers = {**old.layers, **kept.layers} if old and old.turn == kept.turn else kept.layers
                 if not old or layers is not old.layers:
                     self._count += _size(layers) - (_size(old.layers) if old else 0)
                 store[block] = kept._replace(layers=layers)
@@ -339,7 +326,7 @@ def _beginning(first: Ints) -> tuple[bytes, ...]:
 
 
 def _some(kept: Mapping[Block, Kept], blocks: Iterable[Block]) -> dict[Block, Kept]:
-    """Cached blocks, in any state."""
+    """Cached blocks, of any turn."""
     return {block: kept[block] for block in blocks if block in kept}
 
 
@@ -364,37 +351,12 @@ def _at(layers: Layers, name: str, now_ns: int) -> Floats | Floats32:
     return layers[name]
 
 
-def _unmarked(turns: Mapping[Block, int]) -> dict[Block, State]:
-    """States of blocks or squares without ages."""
-    return {one: (turn, NO_AGES) for one, turn in turns.items()}
-
-
-def _marked(
-    turns: Mapping[Block, int], still: StillMap, margin: int | None, near: Callable[[Block], Iterable[Block]]
-) -> dict[Block, State]:
-    """States of blocks, or of squares with a margin. near: blocks whose ages they depend on."""
-    out, ages, marks = dict[Block, State](), still.ages, still.marks
-    for one, turn in turns.items():
-        if (mark := marks.get((margin, one))) is None:
-            mark = marks[margin, one] = _digest(sorted(ages.keys() & near(one)), ages)
-        out[one] = turn, mark
-    return out
-
-
-def _digest(blocks: Sequence[Block], ages: Ages) -> bytes:
-    """Hash of the ages in these blocks."""
-    if not blocks:
-        return NO_AGES
-    parts = (part for block in blocks for part in (repr(block).encode(), ages[block].tobytes()))
-    return hashlib.blake2b(b"".join(parts), digest_size=16).digest()
-
-
-def _valid(kept: Mapping[Block, Kept], states: Mapping[Block, State], names: Sequence[str]) -> dict[Block, Kept]:
-    """Cached blocks in these states, with all these layers; marks them as used."""
+def _valid(kept: Mapping[Block, Kept], turns: Mapping[Block, int], names: Sequence[str]) -> dict[Block, Kept]:
+    """Cached blocks of these turns, with all these layers; marks them as used."""
     out = {}
-    for block, state in states.items():
+    for block, turn in turns.items():
         one = kept.get(block)
-        if one and one.state == state and all(name in one.layers for name in names):
+        if one and one.turn == turn and all(name in one.layers for name in names):
             out[block] = one
             if isinstance(kept, OrderedDict):
                 kept.move_to_end(block)
@@ -471,8 +433,8 @@ def _all_of(rect: Rect) -> Iterable[Block]:
     return product(range(rect[0], rect[0] + rect[2]), range(rect[1], rect[1] + rect[3]))
 
 
-def _within(states: Mapping[Block, State], rect: Rect) -> dict[Block, State]:
-    return {block: state for block, state in states.items() if _is_in(block, rect)}
+def _within(turns: Mapping[Block, int], rect: Rect) -> dict[Block, int]:
+    return {block: turn for block, turn in turns.items() if _is_in(block, rect)}
 
 
 def _newest(

@@ -1,15 +1,14 @@
 """Tiles of the present map, remade where evidence arrives, and of past maps.
 
-A tile is a square of layers (block_layers.py), a function of evidence and road ages. Ages of cells count from its
-newest sample, so time alone changes no tile. Road ages are seconds old, because pages ask ten times a second, and enter
-with new rows.
+A tile is a square of layers (block_layers.py), a function of evidence and repairs. Ages of cells count from its newest
+sample, so time alone changes no tile.
 """
 
 from __future__ import annotations
 
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
 from weakref import ReferenceType, ref
@@ -17,13 +16,13 @@ from weakref import ReferenceType, ref
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import Ages, around
+from mapserver.change.validity import around
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import Block
 from mapserver.query.block_layers import SQUARE, BlockLayers, Kept, Look
 from mapserver.query.region_pieces import PIECE_BYTES
 from mapserver.query.source import MapSource, MapState
-from mapserver.query.views import StillMap, View
+from mapserver.query.views import View
 from protocol.arrays import Ints
 from protocol.queries.answers import MapVersion
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, Plane, TilesAnswer, TilesQuery
@@ -53,13 +52,11 @@ class Drawing:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """State of the tiles: turn of a grid, version and ages drawn, and the origin of each block."""
+    """State of the tiles: turn of a grid and version drawn, and the origin of each block."""
 
     turn: int = -1
     grid: ReferenceType[Grid] | None = None  # a fact may bring another one
     version: MapVersion = NOTHING
-    ages: Ages = field(default_factory=dict)
-    marks: dict[object, bytes] = field(default_factory=dict)
     numbers: dict[Block, int] = field(default_factory=dict)
     drawings: dict[Place, Drawing] = field(default_factory=dict)
 
@@ -67,9 +64,8 @@ class _Drawn:
 class Tiles:
     """Tiles of the present map; thread-safe. Costs depend on changes since the last query."""
 
-    def __init__(self, source: MapSource, layers: BlockLayers, ages: Callable[[], Ages]) -> None:
-        """ages: recent ages of road cells."""
-        self._source, self._layers, self._lately = source, layers, ages
+    def __init__(self, source: MapSource, layers: BlockLayers) -> None:
+        self._source, self._layers = source, layers
         self._cell_m = source.site.cell_m
         self._reach = reach_blocks(self._cell_m, source.config.change)
         self._lock = threading.Lock()
@@ -89,13 +85,12 @@ class Tiles:
 
     def _update(self) -> tuple[MapVersion, int]:
         """Redraw tiles with new evidence in or near them. The state is noted last, so a failure is retried."""
-        ages = self._lately()
-        places, drawn, stamp_ns = self._source.run(lambda state: self._changed(state, ages))
+        places, drawn, stamp_ns = self._source.run(self._changed)
         if drawn.version.row < self._drawn.version.row:  # rows are gone: earlier versions cannot be compared
             self._tiles = {}
         whole = drawn.drawings is not self._drawn.drawings
         for some in _few(sorted({*places, *(self._tiles if whole else ())})):
-            look = self._source.run(lambda state: self._look(state, some, drawn))  # noqa: B023 # called at once
+            look = self._source.run(lambda state: self._look(state, some))  # noqa: B023 # called at once
             blocks = of_tiles(self._layers, look, some)
             others = {block: kept for block, kept in blocks.items() if drawn.numbers.get(block) != kept.number}
             gone = {place: drawn.drawings.setdefault(place, Drawing()) for place in (some if whole else ())}
@@ -108,25 +103,19 @@ class Tiles:
         self._drawn = drawn
         return drawn.version, stamp_ns
 
-    def _changed(self, state: MapState, ages: Ages) -> tuple[set[Place], _Drawn, int]:
+    def _changed(self, state: MapState) -> tuple[set[Place], _Drawn, int]:
         """Tiles that may change, and the state to draw them from."""
         grid, last = state.grid, self._drawn
-        whole = state.version.fact != last.version.fact or last.grid is None or last.grid() is not grid
+        whole = last.grid is None or last.grid() is not grid
         folded, turn = grid.folded_since(-1 if whole else last.turn)
         drawn = replace(last, turn=turn, grid=ref(grid), version=state.version)
-        aged: list[Block] = []
-        if whole or state.version.row != last.version.row:
-            aged = [block for block in ages.keys() | last.ages.keys() if not _is_same(ages, last.ages, block)]
-            if ages is not last.ages:
-                drawn = replace(drawn, ages=ages, marks={})
         if whole:
             drawn = replace(drawn, numbers={}, drawings={})
-        near = folded if whole else [*aged, *(one for block in folded for one in around(block, self._reach))]
+        near = folded if whole else [one for block in folded for one in around(block, self._reach)]
         return {_tile_of(block) for block in near}, drawn, state.newest_ns
 
-    def _look(self, state: MapState, places: Iterable[Place], drawn: _Drawn) -> Look:
-        aged = StillMap(state.grid, state.version, state.newest_ns, drawn.ages, drawn.marks)
-        return self._layers.look_blocks(aged, {block for place in places for block in _blocks(place)}, LAYERS)
+    def _look(self, state: MapState, places: Iterable[Place]) -> Look:
+        return self._layers.look_blocks(state, {block for place in places for block in _blocks(place)}, LAYERS)
 
 
 def _few(places: list[Place]) -> Iterator[list[Place]]:
@@ -141,10 +130,6 @@ def _tile_of(block: Block) -> Place:
 def _blocks(place: Place) -> list[Block]:
     """Blocks of a tile."""
     return [(SQUARE * place[0] + x, SQUARE * place[1] + y) for x, y in product(range(SQUARE), repeat=2)]
-
-
-def _is_same(some: Ages, others: Ages, block: Block) -> bool:
-    return block in some and block in others and bool((some[block] == others[block]).all())
 
 
 def of_tiles(layers: BlockLayers, look: Look, places: Iterable[Place]) -> dict[Block, Kept]:
@@ -191,7 +176,7 @@ def tiles_of(view: View, window: CellWindow, layers: BlockLayers) -> Iterator[Ma
     """Tiles of a view in a window, whose edges are tiles' where the view goes on."""
     look, n = layers.look_at(view), BLOCK_CELLS
     inside = CellWindow(window.column // n, window.row // n, -(-window.columns // n), -(-window.rows // n))
-    places = {_tile_of(block) for block in look.cell_states if _is_in(block, inside)}
+    places = {_tile_of(block) for block in look.cell_turns if _is_in(block, inside)}
     for some in _few(sorted(places)):
         for place, drawing in sorted(draw({}, of_tiles(layers, look, some)).items()):
             yield drawing.tile(place, view.version)

@@ -1,7 +1,7 @@
-"""Road maps: roads, their traffic tally and ground changes, now and as of any time.
+"""Road maps: roads, their traffic tally and repairs, now and as of any time.
 
-The tally follows the journal. Roads and changes are made from one map version in the background; queries use the
-newest, a few seconds old.
+The tally follows the journal. Roads are made from one map version in the background; queries use the newest, a few
+seconds old. What their passes show of repairs is for the writer to decide (mapserver/upkeep/road_repairs.py).
 """
 
 from __future__ import annotations
@@ -14,22 +14,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from weakref import ref
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.change.validity import Ages
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.rows import Selection
-from mapserver.query.source import MapSource, MapState
-from mapserver.query.views import StillGrid, StillMap, View, check_past, surroundings
+from mapserver.query.source import MapReading, MapState
+from mapserver.query.views import check_past
 from mapserver.roads.ledger import Ledger, Ledgers
 from mapserver.roads.network import network
-from mapserver.roads.passes import PassTally
-from mapserver.roads.repairs import Repair, ages, repairs
+from mapserver.roads.passes import Passes, PassTally
+from mapserver.roads.repair_facts import RoadRepair
+from mapserver.roads.repairs import Repair, Strips, repairs, since
 from mapserver.roads.segments import SegmentTable, segments
 from mapserver.roads.skeleton import Pages, Skeletons
 from mapserver.roads.tally import Tally, between
@@ -38,7 +37,7 @@ from protocol.errors import QueryError, Refusal, StoreError
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.answers import MapVersion
-from protocol.site.geometry import BLOCK_CELLS, CellWindow
+from protocol.site.geometry import CellWindow
 from protocol.units import HOUR_NS
 
 log = logging.getLogger("mapserver.query.road_maps")
@@ -50,38 +49,36 @@ CHEAP = 100
 COSTLY = 20  # least age relative to the last making, so that large maps cost no more than 5 %
 SPARE = 3  # lead before roads are too old, in durations of the last making
 ASKED_S = 600.0  # time after the last question during which roads are made
-PATIENCE_S = 2.0  # longest wait of a picture for the first roads
 LOOK_BACK_NS = 30 * 24 * HOUR_NS  # traffic before the site's now; older rows are not read
 
 
 @dataclass(frozen=True)
 class RoadMap:
-    """Roads of one map version, with their tally.
+    """Roads of one map version, with their tally."""
 
-    pages: evidence of the roads; grid: the same, of the present map. changes: of segments' ground, newest first.
-    """
-
-    segments: SegmentTable
     ledgers: Ledgers
     tally: Table
-    changes: tuple[Repair, ...]
-    pages: Pages
     facts: Facts
     version: MapVersion
     stamp_ns: int
-    cell_m: float = 1.0
-    grid: StillGrid | None = None
+    cell_m: float
+
+    @property
+    def segments(self) -> SegmentTable:
+        """Its segments."""
+        return self.ledgers.segments
 
     @cached_property
-    def ages(self) -> Ages:
-        """Start of the present ground of changed road cells."""
-        return ages(self.segments, self.changes, self.cell_m)
+    def strips(self) -> Strips:
+        """Cells of its segments."""
+        return Strips(self.segments, self.cell_m)
 
     @cached_property
-    def still(self) -> StillMap:
-        """The present map of these roads."""
-        assert self.grid
-        return StillMap(self.grid, self.version, self.stamp_ns, self.ages)
+    def changes(self) -> tuple[Repair, ...]:
+        """Repairs proved by then, as long ago as traffic counts, newest first."""
+        first_ns, standing = self.stamp_ns - LOOK_BACK_NS, self.facts.repairs.standing
+        proved = (repair for repair in standing.values() if first_ns < repair.seen_ns <= self.stamp_ns)
+        return tuple(sorted(self.strips.placed(proved), key=lambda one: (-one.seen_ns, one.segment, -one.first_ns)))
 
     @cached_property
     def ledger(self) -> Ledger:
@@ -126,11 +123,21 @@ class Traffic:
 
 @dataclass(frozen=True)
 class _Newest:
-    """The newest roads, when the map was last checked [s], and how long they took."""
+    """The newest roads, when the map was last checked [s], and how long they took.
+
+    passes: over them, all that there were since since_ns.
+    """
 
     roads: RoadMap
     looked_s: float
     took_s: float
+    passes: Passes
+    since_ns: int
+
+    @property
+    def lasts_s(self) -> float:
+        """Time for which they are new enough."""
+        return max(min(FRESH_S, CHEAP * self.took_s), COSTLY * self.took_s)
 
 
 @contextmanager
@@ -148,7 +155,7 @@ class RoadMaps:
     made, made_s: their number and total time.
     """
 
-    def __init__(self, source: MapSource, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, source: MapReading, clock: Callable[[], float] = time.monotonic) -> None:
         """clock: monotonic [s]."""
         self._source, self._cell_m, self._config = source, source.site.cell_m, source.config
         self._clock = clock
@@ -157,6 +164,7 @@ class RoadMaps:
         self._newest: _Newest | None = None
         self.made, self.made_s = 0, 0.0
         self._asked_s = -math.inf  # never
+        self._examined: RoadMap | None = None
         self._begin("", NO_FACTS)
 
     def _begin(self, store: str, facts: Facts) -> None:
@@ -185,19 +193,34 @@ class RoadMaps:
             if not self._newest or self._newest.roads.version.row < row:
                 self._now()
 
-    def lately(self) -> Ages:
-        """Recent ages of cells, for pictures, which wait only for the first roads."""
-        try:
-            with _journal_read():
-                asked_s = self._ask()
-                if not self._fresh(asked_s) and self._lock.acquire(timeout=0.0 if self._newest else PATIENCE_S):
-                    try:
-                        self._now()
-                    finally:
-                        self._lock.release()
-        except QueryError as error:  # the next picture asks again
-            log.warning("no road map reason=%s problem=%r", error.reason, str(error))
-        return self._newest.roads.ages if self._newest else {}
+    def repairs(self) -> tuple[MapVersion, list[RoadRepair]] | None:
+        """Repairs that recent passes show, and withdrawals, for a version of the map; None if nothing is new.
+
+        Keeps roads new, but waits for nobody who makes them.
+        """
+        if not self._source.run(lambda state: state.version.row):
+            return None
+        newest, asked_s = self._newest, self._ask()
+        if not newest or asked_s - newest.looked_s >= max(FRESH_S, COSTLY * newest.took_s):
+            if not self._lock.acquire(blocking=False):
+                return None
+            try:
+                with _journal_read():
+                    self._now()
+            finally:
+                self._lock.release()
+            newest = self._newest
+        if not newest or newest.roads is self._examined:
+            return None
+        self._examined = roads = newest.roads
+        facts, since_ns = roads.facts.repairs, newest.since_ns
+        rootless = (one for one in facts.standing.values() if one.known_ns < since_ns <= one.first_ns)
+        changes, _ = repairs(since(newest.passes, roads.strips.placed(rootless)))
+        shown = {(roads.segments.ids[one.segment], one.first_ns): one for one in changes}
+        proved = {key for key, one in facts.standing.items() if one.seen_ns <= roads.stamp_ns}
+        fresh = roads.strips.located((one for key, one in shown.items() if key not in proved), roads.stamp_ns)
+        events = facts.judged(fresh, shown.keys() & proved, since_ns, roads.stamp_ns)
+        return (roads.version, events) if events else None
 
     def renew(self) -> float:
         """Make present roads, unless there were no questions for long; returns seconds until the next time."""
@@ -209,7 +232,7 @@ class RoadMaps:
         except QueryError as error:  # queries get the same answer
             log.info("no road map reason=%s problem=%r", error.reason, str(error))
         took_s = self._clock() - began_s
-        # rarely, because all layers near new samples are derived again; at most half of the time
+        # at most half of the time
         return max(max(FRESH_S, COSTLY * took_s) - SPARE * took_s, took_s)
 
     def _lately(self) -> RoadMap:
@@ -232,61 +255,53 @@ class RoadMaps:
             return None
         own, now = newest.roads.version, self._source.run(lambda state: state.version)
         is_of_map = (own.store, own.fact) == (now.store, now.fact) and own.row <= now.row
-        oldest_s = max(min(FRESH_S, CHEAP * newest.took_s), COSTLY * newest.took_s)
-        in_time = own == now or asked_s - newest.looked_s <= oldest_s
+        in_time = own == now or asked_s - newest.looked_s <= newest.lasts_s
         return newest.roads if is_of_map and in_time else None
-
-    def view(self, window: CellWindow, reach: int, as_of_ns: int | None) -> View:
-        """Evidence of a window and `reach` blocks around, with ages of roads, now or as of a time."""
-        roads, (left, bottom, right, top) = self.read(as_of_ns), _blocks_of(surroundings(window, reach))
-        near = {
-            block: pages
-            for block, pages in roads.pages.items()
-            if left <= block[0] <= right and bottom <= block[1] <= top
-        }
-        return View(near, roads.version, roads.stamp_ns, roads.ages)
 
     def _now(self) -> RoadMap:
         """Make present roads, unless the newest are."""
         looked_s, newest = self._clock(), self._newest
         # version first, because pages of all blocks cost their owner milliseconds
-        if newest and newest.roads.version == self._source.run(lambda state: state.version):
-            self._newest = replace(newest, looked_s=looked_s)
-            return newest.roads
-        grid, version, facts, newest_ns = self._source.run(_all)
+        version, facts = self._source.run(lambda state: (state.version, state.facts))
+        if newest and (replace(newest.roads.version, fact=version.fact), newest.roads.facts) == (version, facts):
+            same = newest.roads.version == version  # otherwise with other repairs
+            roads = newest.roads if same else replace(newest.roads, facts=facts, version=version)
+            self._newest = replace(newest, roads=roads, looked_s=looked_s)
+            return roads
+        pages, version, facts, newest_ns = self._source.run(_all)
         if self._with != (version.store, facts):
             self._begin(version.store, facts)
         self._follow(self._traffic, facts, newest_ns, self._followed, version.row)
         self._followed = version.row
-        ledgers = Ledgers(segments(network(self._skeletons.skeleton(grid.all_pages))))
-        made = self._map(ledgers, self._traffic, grid.all_pages, facts, version, newest_ns)
-        roads = replace(made, grid=grid)
-        _ = roads.still  # here rather than in the first query
+        ledgers = Ledgers(segments(network(self._skeletons.skeleton(pages))))
+        roads = self._map(ledgers, self._traffic.tally, facts, version, newest_ns)
+        _ = roads.changes  # here rather than in the first query
+        from_ns = _first_hour(newest_ns) * HOUR_NS
+        passes = self._traffic.passes.passes(ledgers, from_ns)
         took_s = self._clock() - looked_s
-        self._newest = _Newest(roads, looked_s, took_s)
+        self._newest = _Newest(roads, looked_s, took_s, passes, max(from_ns, self._traffic.passes.since_ns))
         self.made, self.made_s = self.made + 1, self.made_s + took_s
         return roads
 
     def _as_of(self, as_of_ns: int, machine: str) -> RoadMap:
         self._source.run(lambda state: check_past(state, None, 0))
         version, facts = self._source.run(lambda state: (state.version, state.facts))
-        traffic = Traffic()
+        traffic = Tally()
         with self._source.location.reader() as reader:
             grid = self._source.past.grid_as_of(reader, as_of_ns, None, facts)
         self._follow(traffic, facts, as_of_ns, 0, version.row, as_of_ns, machine)
-        pages = _pages(grid)
-        ledgers = Ledgers(segments(network(Skeletons(self._cell_m).skeleton(pages))))
-        return self._map(ledgers, traffic, pages, facts, version, as_of_ns)
+        ledgers = Ledgers(segments(network(Skeletons(self._cell_m).skeleton(_pages(grid)))))
+        return self._map(ledgers, traffic, facts, version, as_of_ns)
 
     def _alone(self, roads: RoadMap, machine: str) -> RoadMap:
         """The same roads with one machine's traffic, read from the journal."""
-        traffic = Traffic()
+        traffic = Tally()
         self._follow(traffic, roads.facts, roads.stamp_ns, 0, roads.version.row, machine=machine)
-        return self._map(roads.ledgers, traffic, roads.pages, roads.facts, roads.version, roads.stamp_ns)
+        return self._map(roads.ledgers, traffic, roads.facts, roads.version, roads.stamp_ns)
 
     def _follow(
         self,
-        traffic: Traffic,
+        traffic: Traffic | Tally,
         facts: Facts,
         newest_ns: int,
         after: int,
@@ -297,7 +312,7 @@ class RoadMaps:
         """Add rows after < row <= until to the traffic: samples up to `to_ns`, of one machine or all."""
         if after >= until:
             return
-        begin_ns = max(0, newest_ns - LOOK_BACK_NS) // HOUR_NS * HOUR_NS
+        begin_ns = _first_hour(newest_ns) * HOUR_NS
         with self._source.location.reader() as reader:
             selection = Selection.by(facts, begin_ns, to_ns)
             for samples, names in self._source.past.samples(reader, selection, after, until):
@@ -306,21 +321,19 @@ class RoadMaps:
                     wanted &= names == np.uint64(name_hash(machine))
                 traffic.add(samples[wanted], names[wanted])
 
-    def _map(
-        self, ledgers: Ledgers, traffic: Traffic, pages: Pages, facts: Facts, version: MapVersion, stamp_ns: int
-    ) -> RoadMap:
+    def _map(self, ledgers: Ledgers, traffic: Tally, facts: Facts, version: MapVersion, stamp_ns: int) -> RoadMap:
         """Assemble a road map; limits the look back, independently of when the journal was followed."""
-        first = max(0, stamp_ns - LOOK_BACK_NS) // HOUR_NS
-        table = between(traffic.tally.table(), first, MAX_STAMP_NS // HOUR_NS + 1)
-        changes, _ = repairs(traffic.passes.passes(ledgers, first * HOUR_NS))
-        newest_first = tuple(sorted(changes, key=lambda change: (-change.seen, change.segment)))
-        return RoadMap(ledgers.segments, ledgers, table, newest_first, pages, facts, version, stamp_ns, self._cell_m)
+        table = between(traffic.table(), _first_hour(stamp_ns), MAX_STAMP_NS // HOUR_NS + 1)
+        return RoadMap(ledgers, table, facts, version, stamp_ns, self._cell_m)
 
 
-def _all(state: MapState) -> tuple[StillGrid, MapVersion, Facts, int]:
-    pages = _pages(state.grid)
-    turns = dict(zip(pages, state.grid.last_turns(pages), strict=True))
-    return StillGrid(pages, turns, ref(state.grid)), state.version, state.facts, state.newest_ns
+def _first_hour(stamp_ns: int) -> int:
+    """First hour whose traffic counts at a time."""
+    return max(0, stamp_ns - LOOK_BACK_NS) // HOUR_NS
+
+
+def _all(state: MapState) -> tuple[Pages, MapVersion, Facts, int]:
+    return _pages(state.grid), state.version, state.facts, state.newest_ns
 
 
 def _pages(grid: Grid) -> Pages:
@@ -330,13 +343,6 @@ def _pages(grid: Grid) -> Pages:
     west, south, east, north = bounds
     blocks = grid.blocks_in(CellWindow(west, south, east - west, north - south))
     return dict(zip(blocks, grid.pages(blocks), strict=True))
-
-
-def _blocks_of(window: CellWindow) -> tuple[int, int, int, int]:
-    """First and last block column and row of a window aligned to blocks."""
-    n = BLOCK_CELLS
-    left, bottom = window.column // n, window.row // n
-    return left, bottom, left + window.columns // n - 1, bottom + window.rows // n - 1
 
 
 def warm_up(config: FoldConfig) -> None:

@@ -37,7 +37,7 @@ GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled", "visit
 
 
 class Routes:
-    """Answers about routes of one map; thread-safe. look: at squares, at a time, with or without road ages."""
+    """Answers about routes of one map; thread-safe. look: at squares, at a time."""
 
     def __init__(self, source: MapSource, layers: BlockLayers, look: Callable[..., Look]) -> None:
         self._source, self._layers, self._look = source, layers, look
@@ -159,8 +159,8 @@ class Routes:
             wanted |= more
 
     def _read_once(self, squares: Set[Block], query: LineQuery) -> tuple[Look, Squares]:
-        look = self._look(squares, LAYERS, query.as_of_ns, repairs=query.repairs)
-        if (count := len(look.area_states)) > MOST_SQUARES:
+        look = self._look(squares, LAYERS, query.as_of_ns)
+        if (count := len(look.area_turns)) > MOST_SQUARES:
             problem = f"{count} squares of {SQUARE_CELLS} cells with known ground along the line, over {MOST_SQUARES}"
             raise QueryError(Refusal.TOO_LARGE, f"{problem}: ask for it in parts, from place to place")
         layers = self._layers.squares(look, squares, LAYERS)

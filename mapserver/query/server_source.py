@@ -19,16 +19,24 @@ from protocol.queries.request import Request
 T = TypeVar("T")
 
 
-class ServerSource:
-    """See `MapSource`."""
+class ServerReading:
+    """See `MapReading`."""
 
-    def __init__(self, writer: Writer, upkeep: Upkeep, past: StorePast) -> None:
-        self._writer, self._upkeep, self.past = writer, upkeep, past
-        self.site, self.config, self.location, self.waits = writer.site, writer.config, writer.location, writer.waits
+    def __init__(self, writer: Writer, past: StorePast) -> None:
+        self._writer, self.past = writer, past
+        self.site, self.config, self.location = writer.site, writer.config, writer.location
 
     def run(self, work: Callable[[MapState], T]) -> T:
         """See `Writer.look`."""
         return self._writer.look(work)
+
+
+class ServerSource(ServerReading):
+    """See `MapSource`."""
+
+    def __init__(self, writer: Writer, upkeep: Upkeep, past: StorePast) -> None:
+        super().__init__(writer, past)
+        self._upkeep, self.waits = upkeep, writer.waits
 
     def changes(self, after: int) -> list[GroundChange]:
         """See `Upkeep`."""

@@ -50,12 +50,11 @@ class MapState(Protocol):
         """Names of machines that have sent samples."""
 
 
-class MapSource(Protocol):
-    """A source of a site's map; thread-safe. Each call may raise QueryError. waits: for journal rows."""
+class MapReading(Protocol):
+    """A site's map and its past; thread-safe. Each call may raise QueryError."""
 
     site: SiteConfig
     config: ServerConfig
-    waits: MergeWaits
 
     @property
     def location(self) -> JournalLocation:
@@ -67,6 +66,12 @@ class MapSource(Protocol):
 
     def run(self, work: Callable[[MapState], T]) -> T:
         """Run short `work` on the present map."""
+
+
+class MapSource(MapReading, Protocol):
+    """A source of a site's map. waits: for journal rows."""
+
+    waits: MergeWaits
 
     def changes(self, after: int) -> list[GroundChange]:
         """Changes numbered above `after`."""

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
-from itertools import product
-from weakref import ReferenceType
 
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import Ages, Pages, valid_pages
+from mapserver.change.validity import Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
-from mapserver.evidence.timeline import NO_PAGES, Block, TimedPages, evidence
+from mapserver.evidence.timeline import Ages, Block, evidence
 from mapserver.journal.facts import Facts
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.location import JournalLocation
@@ -26,7 +23,7 @@ from mapserver.layers.lanes import lane_tile
 from mapserver.past.cell_history import CellHistory, cell_history
 from mapserver.past.past import StorePast
 from mapserver.query.source import MapState
-from protocol.arrays import AnyArray, Floats32, Ints
+from protocol.arrays import AnyArray, Floats32
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import MapVersion
 from protocol.queries.lanes import LanesAnswer
@@ -85,59 +82,13 @@ def check_blocks(count: int, instead: str) -> None:
 class View:
     """Pages of a window's blocks and those around.
 
-    version: of their map. stamp_ns: their time. ages: of ground with changes known otherwise.
+    version: of their map. stamp_ns: their time. ages: of the ground of repaired roads.
     """
 
     pages: Pages
     version: MapVersion
     stamp_ns: int
     ages: Ages = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class StillGrid:
-    """A grid's content in one turn, read like a grid. turns: of all blocks; grid: its source."""
-
-    all_pages: Pages
-    turns: Mapping[Block, int]
-    grid: ReferenceType[Grid]
-
-    def blocks_in(self, window: CellWindow) -> list[Block]:
-        """As `Grid.blocks_in`."""
-        n, (x, y) = BLOCK_CELLS, self._places.T
-        columns = range(window.column // n, (window.column + window.columns - 1) // n + 1)
-        rows = range(window.row // n, (window.row + window.rows - 1) // n + 1)
-        if len(columns) * len(rows) > len(self.all_pages):
-            inside = (x >= columns.start) & (x < columns.stop) & (y >= rows.start) & (y < rows.stop)
-            return list(map(tuple, self._places[inside].tolist()))
-        return [block for block in product(columns, rows) if block in self.all_pages]
-
-    @cached_property
-    def _places(self) -> Ints:
-        """All blocks (n, 2), sorted."""
-        return np.array(sorted(self.all_pages), np.int64).reshape(-1, 2)
-
-    def last_turns(self, blocks: Iterable[Block]) -> list[int]:
-        """As `Grid.last_turns`."""
-        return [self.turns.get(block, -1) for block in blocks]
-
-    def pages(self, blocks: Iterable[Block]) -> list[TimedPages]:
-        """As `Grid.pages`."""
-        return [self.all_pages.get(block, NO_PAGES) for block in blocks]
-
-
-@dataclass(frozen=True)
-class StillMap:
-    """A map version, present or past, with ages from changed roads. newest_ns: as in MapState.
-
-    marks: hashes of ages by block or square, cached by readers.
-    """
-
-    grid: StillGrid | Grid
-    version: MapVersion
-    newest_ns: int
-    ages: Ages
-    marks: dict[object, bytes] = field(default_factory=dict, compare=False)
 
 
 @dataclass(frozen=True)
@@ -153,7 +104,8 @@ class PastMaps:
         reach = reach_blocks(self.past.cell_m, self.config.change)
         with self._reader(facts) as (reader, _):
             grid = self.past.grid_as_of(reader, stamp_ns, surroundings(window, reach), facts, version.row)
-        return View(_pages(grid, window, reach), version, stamp_ns)
+        pages = _pages(grid, window, reach)
+        return View(pages, version, stamp_ns, facts.repairs.ages_as_of(stamp_ns, pages.keys()))
 
     def history(
         self, cell: tuple[int, int], times: tuple[int, int], span_ns: int, facts: Facts
@@ -174,7 +126,7 @@ class PastMaps:
 def view_now(state: MapState, window: CellWindow) -> View:
     """The present map, on its thread."""
     reach = reach_blocks(state.site.cell_m, state.config.change)
-    return View(_pages(state.grid, window, reach), state.version, state.newest_ns)
+    return View(_pages(state.grid, window, reach), state.version, state.newest_ns, state.facts.repairs.ages)
 
 
 def view_of(grid: Grid, window: CellWindow, config: ServerConfig) -> View:

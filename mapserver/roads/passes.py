@@ -45,6 +45,11 @@ class PassTally:
             own = self._machines.setdefault(name, Tally(MINUTE_NS, MINUTES, CELL_M))
             own.add(rows[names == name], names[names == name])
 
+    @property
+    def since_ns(self) -> int:
+        """All passes of all machines since then are known."""
+        return max((tally.since_ns for tally in self._machines.values()), default=0)
+
     def passes(self, ledgers: Ledgers, from_ns: int = 0) -> Passes:
         """Passes with known c_rr."""
         tables = [tally.table() for _, tally in sorted(self._machines.items())]

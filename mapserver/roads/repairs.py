@@ -16,11 +16,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mapserver.error_model import PLACE_SHARE, PLACE_STD
-from mapserver.evidence.timeline import Block
 from mapserver.roads.passes import MINUTE_NS, Passes
+from mapserver.roads.repair_facts import Cells, RoadRepair, cells_of, places_of
 from mapserver.roads.segments import SegmentTable
-from protocol.arrays import Ints
-from protocol.site.geometry import BLOCK_CELLS
+from protocol.arrays import Floats, Ints
 
 HALF_WIDTH_M = 3.0  # metres of the driven strip with position errors, half a lane distance
 
@@ -52,24 +51,26 @@ TUNING = RepairTuning()
 class Repair:
     """A change of a segment's ground.
 
-    minute, seen: first pass after it, and the pass that proved it. before, after: median c_rr.
+    known_ns, first_ns: the earliest pass that it rests on, and the first one after it, to the minute. seen_ns: when it
+    was proved. before, after: median c_rr.
     """
 
     segment: int
-    minute: int
-    seen: int
+    known_ns: int
+    first_ns: int
+    seen_ns: int
     before: float
     after: float
 
-    @property
-    def first_ns(self) -> int:
-        """First pass after the change, to the minute."""
-        return self.minute * MINUTE_NS
 
-    @property
-    def seen_ns(self) -> int:
-        """When it was proved."""
-        return (self.seen + 1) * MINUTE_NS
+def since(passes: Passes, earlier: Iterable[Repair]) -> Passes:
+    """Passes after earlier changes of their segments."""
+    begin_ns = np.zeros(int(passes.segment.max(initial=-1)) + 1, np.int64)
+    for one in earlier:
+        if one.segment < len(begin_ns):
+            begin_ns[one.segment] = max(begin_ns[one.segment], one.first_ns)
+    later = passes.minute * MINUTE_NS >= begin_ns[passes.segment]
+    return Passes(**{name: column[later] for name, column in passes._asdict().items()})
 
 
 def repairs(passes: Passes, tuning: RepairTuning = TUNING) -> tuple[list[Repair], int]:
@@ -79,8 +80,9 @@ def repairs(passes: Passes, tuning: RepairTuning = TUNING) -> tuple[list[Repair]
     cuts, looks = _cuts(passes.c_rr, passes.machine, 2 * passes.machine + passes.direction, bounds, tuning)
     for first, at, sure, end in cuts.tolist():
         before, after = (float(np.median(passes.c_rr[part])) for part in (slice(first, at), slice(at, end)))
-        minute, seen = passes.minute[[at, sure]].tolist()
-        out.append(Repair(int(passes.segment[at]), minute, seen, before, after))
+        known, minute, seen = passes.minute[[max(first, at - tuning.most_known), at, sure]].tolist()
+        stamps = known * MINUTE_NS, minute * MINUTE_NS, (seen + 1) * MINUTE_NS
+        out.append(Repair(int(passes.segment[at]), *stamps, before, after))
     return out, looks
 
 
@@ -169,26 +171,52 @@ def _agree(before: Any, after: Any) -> bool:
     return bool((after != after[0]).any() or (before == before[0]).all())
 
 
-def ages(segments: SegmentTable, changes: Iterable[Repair], cell_m: float) -> dict[Block, Ints]:
-    """Start [ns] of each cell's present ground (256,), 0 if unchanged, in blocks of changed segments.
+class Strips:
+    """Cells of segments: within HALF_WIDTH_M of a segment's line, and nearest to it."""
 
-    Covers cells nearest to a changed segment and within HALF_WIDTH_M of its line.
-    """
-    newest: dict[int, int] = {}
-    for change in changes:
-        newest[change.segment] = max(change.first_ns, newest.get(change.segment, 0))
-    out: dict[Block, Ints] = {}
-    if not newest:
+    def __init__(self, segments: SegmentTable, cell_m: float) -> None:
+        self._segments, self._cell_m = segments, cell_m
+        self._owner = np.repeat(np.arange(len(segments.ids)), np.diff(segments.ends))
+        self._tree = cKDTree(segments.points) if len(segments.ids) else None
+
+    def located(self, changes: Iterable[Repair], stamp_ns: int) -> list[RoadRepair]:
+        """Repairs with their cells, decided at a site time [ns]; those of segments without cells are left out."""
+        out, cells = [], dict[int, Cells]()
+        for one in changes:
+            own = cells[one.segment] = cells.get(one.segment) or self._cells(one.segment)
+            stamps = one.known_ns, one.first_ns, min(one.seen_ns, stamp_ns)
+            if own:
+                out.append(
+                    RoadRepair(
+                        self._segments.ids[one.segment], *stamps, one.before, one.after, self._cell_m, own, stamp_ns
+                    )
+                )
         return out
-    owner, tree = np.repeat(np.arange(len(segments.ids)), np.diff(segments.ends)), cKDTree(segments.points)
-    for segment, begin_ns in newest.items():
-        line = segments.line(segment)
-        first = np.floor((line.min(axis=0) - HALF_WIDTH_M) / cell_m).astype(np.int64)
-        last = np.floor((line.max(axis=0) + HALF_WIDTH_M) / cell_m).astype(np.int64)
-        x, y = (grid.ravel() for grid in np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True))))
-        off_m, nearest = tree.query((np.stack([x, y], axis=1) + 0.5) * cell_m)
-        own = (off_m <= HALF_WIDTH_M) & (owner[nearest] == segment)
-        for column, row in zip(x[own].tolist(), y[own].tolist(), strict=True):
-            block = out.setdefault((column // BLOCK_CELLS, row // BLOCK_CELLS), np.zeros(BLOCK_CELLS**2, np.int64))
-            block[row % BLOCK_CELLS * BLOCK_CELLS + column % BLOCK_CELLS] = begin_ns
-    return out
+
+    def placed(self, repairs: Iterable[RoadRepair]) -> list[Repair]:
+        """Repairs on the segments that have most of their cells; others are left out."""
+        out = []
+        for one in repairs:
+            off_m, nearest = self._nearest(places_of(one.cells))
+            counts = np.bincount(self._owner[nearest[off_m <= HALF_WIDTH_M]])
+            if len(counts):
+                stamps = one.known_ns, one.first_ns, one.seen_ns
+                out.append(Repair(int(counts.argmax()), *stamps, one.before, one.after))
+        return out
+
+    def _cells(self, segment: int) -> Cells:
+        line = self._segments.line(segment)
+        first = np.floor((line.min(axis=0) - HALF_WIDTH_M) / self._cell_m).astype(np.int64)
+        last = np.floor((line.max(axis=0) + HALF_WIDTH_M) / self._cell_m).astype(np.int64)
+        grids = np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True)))
+        places = np.stack([grid.ravel() for grid in grids], axis=1)
+        off_m, nearest = self._nearest(places)
+        own = (off_m <= HALF_WIDTH_M) & (self._owner[nearest] == segment)
+        return cells_of(*places[own].T)
+
+    def _nearest(self, places: Ints) -> tuple[Floats, Ints]:
+        """Distances [m] of cells (n, 2) from the nearest points of lines, and these; none without roads."""
+        if self._tree is None:
+            return np.empty(0), np.empty(0, np.int64)
+        off_m, nearest = self._tree.query((places + 0.5) * self._cell_m)
+        return off_m, nearest

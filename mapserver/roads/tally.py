@@ -43,14 +43,14 @@ _SECTOR_RAD = 2 * np.pi / SECTORS
 
 
 class Tally:
-    """Sums by span of time; `slots` driven spans are kept, newest first."""
+    """Sums by span of time; `slots` driven spans are kept, newest first. since_ns: begin of those, 0 for all."""
 
     def __init__(self, slot_ns: int = HOUR_NS, slots: int = HOURS, cell_m: float = CELL_M) -> None:
         """cell_m: divides the lattice's cell."""
         self.slot_ns, self.cell_m, self._slots = slot_ns, cell_m, slots
         self._table: Table = np.zeros(0, TALLY)
         self._pending: list[Table] = []
-        self._waiting = 0
+        self._waiting = self.since_ns = 0
 
     def add(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Add corrected samples (n,) that may vote by position; names (n,): hashes of machine names."""
@@ -68,6 +68,8 @@ class Tally:
             each = slot(whole["key"])
             kept = np.unique(each)[-self._slots :]
             self._table = whole[int(np.searchsorted(each, kept[0])) :].copy() if len(kept) else whole
+            if len(self._table) < len(whole):
+                self.since_ns = int(kept[0]) * self.slot_ns
         return self._table
 
 

@@ -20,7 +20,7 @@ from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around, has_change
 from mapserver.evidence.timeline import Block, TimedPages
-from mapserver.ingest.decisions import calibrations
+from mapserver.ingest.decisions import ground_decisions
 from mapserver.ingest.writer import Writer
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import archive
@@ -200,7 +200,7 @@ class Archiving:
         self._keep_s = time.monotonic() + KEEP_S
         newest = self._writer.run(lambda store: store.fact)
         if folder.exists() and newest != self._kept:
-            archived_decisions.save(folder, self._writer.store_id, calibrations(self._reader))
+            archived_decisions.save(folder, self._writer.store_id, ground_decisions(self._reader))
             self._kept = newest
 
     def _forget(self, until: int) -> int:

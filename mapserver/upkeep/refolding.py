@@ -16,7 +16,7 @@ from mapserver.calibration.calibrate import Solution
 from mapserver.calibration.correction import Correction, SampleCorrections
 from mapserver.calibration.decision import CalibrationDecision
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.decisions import Decision, Decisions
+from mapserver.ingest.decisions import Decisions, MachineDecision
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
@@ -98,7 +98,7 @@ class Refolding:
         """
         return write(self._writer, lambda store: self._calibrate(store, solved, stamp_ns, asked=asked))
 
-    def decide(self, decision: Decision) -> int:
+    def decide(self, decision: MachineDecision) -> int:
         """Store a decision and have the map rebuilt; returns its number, to wait for.
 
         QueryError if it cannot be written: nothing changes, unless the error says that this is unknown.
@@ -135,7 +135,7 @@ class Refolding:
             store.confirm(self._decisions.calibration.confirmed)
         return self._keep(store, () if waits else decisions)
 
-    def _keep(self, store: Store, decisions: Sequence[Decision]) -> int:
+    def _keep(self, store: Store, decisions: Sequence[MachineDecision]) -> int:
         """Store decisions; returns their number since the start."""
         facts = store.decide(*decisions) if decisions else None
         for decision in decisions:
@@ -234,7 +234,7 @@ def write(writer: Writer, work: Callable[[Store], T]) -> T:
         raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
 
 
-def _log(decision: Decision) -> None:
+def _log(decision: MachineDecision) -> None:
     if isinstance(decision, TrustDecision):
         values = (decision.machine, decision.trusted, decision.by, decision.reason)
         log.warning("trust machine=%s trusted=%s by=%s reason=%r", *values)

@@ -1,4 +1,4 @@
-"""The upkeep: a thread beside the writer with six jobs in turn, and one that rebuilds the map."""
+"""The upkeep: a thread beside the writer with seven jobs in turn, and one that rebuilds the map."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from mapserver.upkeep.calibrating import Calibrating
 from mapserver.upkeep.checkpointing import Checkpointing
 from mapserver.upkeep.jobs import Archiving, Audit, ChangeSearch, Job, Publish
 from mapserver.upkeep.refolding import Refolding
+from mapserver.upkeep.road_repairs import Find, RoadRepairs
 from mapserver.upkeep.snapshots import Snapshots
 from protocol.errors import QueryError, Refusal, SitegridError, StoreError
 from protocol.queries.answers import GroundChange
@@ -32,9 +33,12 @@ log = logging.getLogger("mapserver.upkeep.upkeep")
 
 
 class Upkeep:
-    """Machines and changes of one site. Thread-safe. publish: takes new and extended changes."""
+    """Machines and changes of one site. Thread-safe.
 
-    def __init__(self, writer: Writer, publish: Publish, past: StorePast) -> None:
+    publish: takes new and extended changes. find: as in `RoadRepairs`.
+    """
+
+    def __init__(self, writer: Writer, publish: Publish, past: StorePast, find: Find) -> None:
         self._writer = writer
         self._reader = reader = writer.location.reader()
         self._ending = threading.Event()
@@ -53,6 +57,7 @@ class Upkeep:
             archiving,
             self._checkpointing,
             self._calibrating,
+            RoadRepairs(writer, find),
         )
         self._thread = threading.Thread(target=self._run, args=(jobs,), name="upkeep", daemon=True)
         self._thread.start()

@@ -71,7 +71,6 @@ class ValueForm(Enum):
     NUMBER = auto()
     TEXT = auto()
     LINE = auto()  # of a person, percent-encoded in selectors
-    FLAG = auto()
     STAMP = auto()
     PLACE = auto()  # in metres, like the next two
     PLACES = auto()
@@ -137,17 +136,6 @@ def _check_stamp(name: str, value: int) -> None:
 
 
 STAMP = ValueKind(ValueForm.STAMP, _read_stamp, str, _check_stamp)  # nanoseconds since 1970, UTC, all digits
-
-
-def flag(*, usual: bool) -> ValueKind:
-    """Yes or no, as 1 or 0; the usual one is left out."""
-
-    def read(name: str, text: str) -> bool:
-        if text not in ("0", "1"):
-            raise refusal(name, f"{text[:40]!r} is neither 0 nor 1")
-        return text == "1"
-
-    return ValueKind(ValueForm.FLAG, read, lambda value: "" if value == usual else str(int(value)))
 
 
 def choice(values: Mapping[str, Any], usual: str = "") -> ValueKind:

@@ -12,10 +12,9 @@ from enum import Enum, auto
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from protocol.errors import QueryError, Refusal
-from protocol.queries.parameters import MAX_WAIT_S, STAMP, Parameters, ValueKind, count, flag, number
+from protocol.queries.parameters import MAX_WAIT_S, STAMP, Parameters, ValueKind, count, number
 
 T = TypeVar("T")
-REPAIRS = "1: roads whose ground changed are read from the samples since; 0: from all samples"
 ASKED = "asked"
 
 
@@ -214,19 +213,7 @@ class AsOf(MapQuery[T]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Repaired(AsOf[T]):
-    """A query of cells. repairs: on changed roads, as in `worklist`, only samples since the change."""
-
-    repairs: bool = asked(flag(usual=False), "repairs", f"{REPAIRS} (default 0)", default=False)
-
-    @property
-    def reads_past(self) -> bool:
-        """See `MapQuery`."""
-        return self.as_of_ns is not None or self.repairs
-
-
-@dataclass(frozen=True, kw_only=True)
-class Compared(Repaired[T]):
+class Compared(AsOf[T]):
     """A query of comparable values. minus_ns: subtract the map as of this time."""
 
     minus_ns: int | None = asked(STAMP, "minus", "subtract the map as of this time", None)
@@ -239,4 +226,4 @@ class Compared(Repaired[T]):
     @property
     def reads_past(self) -> bool:
         """See `MapQuery`."""
-        return self.times != (None,) or self.repairs
+        return self.times != (None,)

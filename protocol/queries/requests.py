@@ -18,7 +18,7 @@ from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.parameters import METRES, STAMP, WORDS, check_order, count, number, refusal
 from protocol.queries.places import AREA, Place, around, places
 from protocol.queries.reasons import CellReasons, decode_why, encode_why
-from protocol.queries.request import AskFirst, Codec, Compared, Fresh, MapQuery, Repaired, Size, asked, grouped, parse
+from protocol.queries.request import AskFirst, AsOf, Codec, Compared, Fresh, MapQuery, Size, asked, grouped, parse
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
@@ -202,7 +202,7 @@ class ChangesQuery(MapQuery[answers.ChangesAnswer]):
 
 
 @dataclass(frozen=True)
-class WhyQuery(Repaired[CellReasons]):
+class WhyQuery(AsOf[CellReasons]):
     """All about the cell at a position in `map` [m]."""
 
     x_m: float = asked(METRES, "x", X)

@@ -15,7 +15,6 @@ from protocol.queries.parameters import (
     ValueForm,
     ValueKind,
     choice,
-    flag,
     name_of,
     number,
     read_number,
@@ -23,7 +22,7 @@ from protocol.queries.parameters import (
     text_of,
 )
 from protocol.queries.places import PLACE, Place, places
-from protocol.queries.request import REPAIRS, AsOf, Codec, Fresh, Group, Parameter, Size, asked, grouped
+from protocol.queries.request import AsOf, Codec, Fresh, Group, Parameter, Size, asked, grouped
 from protocol.queries.routing import (
     LOADER,
     MACHINES,
@@ -121,8 +120,7 @@ class LineQuery(AsOf[RouteAnswer], Fresh[RouteAnswer]):
     """A query of lines over the map.
 
     machine: a kind, or one of the site. stops: standing at begin, at end. step_m: of the answer. unknown: unknown
-    ground as DEAREST, REFUSE or a rolling resistance coefficient. repairs: on changed roads, only samples since the
-    change.
+    ground as DEAREST, REFUSE or a rolling resistance coefficient.
     """
 
     machine: RouteMachine | NamedMachine = grouped(_MACHINE, LOADER)
@@ -131,7 +129,6 @@ class LineQuery(AsOf[RouteAnswer], Fresh[RouteAnswer]):
     unknown: str | float = asked(
         UNKNOWN, "unknown", "ground that nobody knows: dearest, refuse or a resistance", DEAREST
     )
-    repairs: bool = asked(flag(usual=True), "repairs", f"{REPAIRS} (default 1)", default=True)
 
     codec = Codec(encode_answer, decode_answer)
 
@@ -142,8 +139,8 @@ class LineQuery(AsOf[RouteAnswer], Fresh[RouteAnswer]):
 
     @property
     def may_read_journal(self) -> bool:
-        """See `MapQuery`."""
-        return self.reads_past or self.repairs
+        """See `MapQuery`: for a machine of the site."""
+        return self.reads_past or isinstance(self.machine, NamedMachine)
 
     def check_steps(self, length_m: float) -> None:
         """Refuse too many steps."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from argparse import ArgumentParser, BooleanOptionalAction, Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Container, Mapping
 from typing import Any
 
@@ -31,9 +31,7 @@ def add_parameters(parser: ArgumentParser, query: type[MapQuery[Any]], without: 
 def _add(parser: ArgumentParser, one: Parameter) -> None:
     option: dict[str, Any] = {"dest": dest(one.name), "help": one.help.replace("%", "%%")}
     form = one.kind.form
-    if form is ValueForm.FLAG:
-        option |= {"action": BooleanOptionalAction}
-    elif form is ValueForm.STAMP:
+    if form is ValueForm.STAMP:
         option |= {"type": site_time, "metavar": "TIME"}
     elif form in NUMBERS:
         option |= {"type": float, "nargs": NUMBERS[form], "metavar": SIDES if form is ValueForm.RECTANGLE else "M"}
@@ -64,8 +62,6 @@ def _text(one: Parameter, value: Any, now_ns: Callable[[], int]) -> str:
     match one.kind.form:
         case ValueForm.STAMP:
             return str(value.stamp(f"--{one.name.replace('_', '-')}", now_ns))
-        case ValueForm.FLAG:
-            return str(int(value))
         case ValueForm.LINE:
             return one.kind.write(value)
     return numbers(value) if isinstance(value, list) else str(value)

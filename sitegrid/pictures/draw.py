@@ -96,7 +96,7 @@ def draw_line(client: Client, out: Path, query: LineQuery, bounds: list[float] |
     low, high = answer.line_m.min(axis=0) - AROUND_M, answer.line_m.max(axis=0) + AROUND_M
     chosen = _bounds(client, bounds) if bounds else Bounds(*low.tolist(), *high.tolist())
     layers = "resistance", "resistance_filled"
-    region = client.ask(RegionQuery(chosen, layers, as_of_ns=query.as_of_ns, repairs=query.repairs))
+    region = client.ask(RegionQuery(chosen, layers, as_of_ns=query.as_of_ns))
     write_image(out, draw_drive(region, answer))
 
 

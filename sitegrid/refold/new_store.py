@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mapserver.calibration.decision import CalibrationDecision
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid_state import GridState
-from mapserver.ingest.decisions import calibrations, plain
+from mapserver.ingest.decisions import GroundDecision, ground_decisions, plain
 from mapserver.ingest.store import Store
 from mapserver.ingest.store_folder import hold_place
 from mapserver.journal.archive import FOLDER, file_name
@@ -59,14 +58,14 @@ class NewStore:
             depends_on = StorePast.of_store(self.folder, self.site.cell_m, config.fold).depends_on(journal, facts)
         save_snapshot(self.folder, self.rows, depends_on(OPEN_END_NS), state)
 
-    def fill_journal(self, watermarks: Mapping[SpoolKey, Watermark], decisions: Sequence[CalibrationDecision]) -> None:
+    def fill_journal(self, watermarks: Mapping[SpoolKey, Watermark], decisions: Sequence[GroundDecision]) -> None:
         """Continue the journal after the archive, with the decisions about its samples."""
         with closing(JournalLocation(self.folder).open_file(self.site.name, self.site.frame)) as journal:
             if not journal.last_row:
                 journal.follow_archive(self.rows, watermarks)
             if not journal.events():
                 journal.append_events(map(plain, decisions))
-            known = (journal.last_row, journal.watermarks(), calibrations(journal))
+            known = (journal.last_row, journal.watermarks(), ground_decisions(journal))
             if known != (self.rows, watermarks, list(decisions)):
                 raise _of_another(self.folder)
 

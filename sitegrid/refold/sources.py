@@ -10,9 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from mapserver.calibration.decision import CalibrationDecision
 from mapserver.config import ServerConfig
-from mapserver.ingest.decisions import calibrations
+from mapserver.ingest.decisions import GroundDecision, ground_decisions
 from mapserver.ingest.map_info import lacking
 from mapserver.ingest.store import ACCEPTED
 from mapserver.journal import archived_decisions
@@ -36,7 +35,7 @@ class Source:
 
     path: Path | FilePlace | JournalLocation
     parts: tuple[Part, ...]
-    decisions: Sequence[CalibrationDecision]
+    decisions: Sequence[GroundDecision]
     stores: tuple[str, ...] = ()
     site: SiteConfig | None = None
     watermarks: Mapping[SpoolKey, Watermark] = field(default_factory=dict)
@@ -77,7 +76,7 @@ def _store(location: JournalLocation) -> Source:
         stores = (identity.id, *identity.descends, *accepted)
         parts: tuple[Part, ...] = (*map(FilePart, files), *rest)
         path, site = (location, None) if location.is_shared else (location.folder, _site_of(location.folder))
-        return Source(path, parts, calibrations(journal), stores, site, journal.watermarks())
+        return Source(path, parts, ground_decisions(journal), stores, site, journal.watermarks())
 
 
 def _site_of(store: Path) -> SiteConfig | None:
@@ -114,15 +113,15 @@ def chosen_config(sources: Sequence[Source], arguments: Namespace) -> tuple[Serv
     return from_table(ServerConfig, load_toml(path), str(path)), path.read_text(encoding="utf-8")
 
 
-def joined_decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[CalibrationDecision]:
+def joined_decisions(histories: Iterable[Sequence[GroundDecision]]) -> list[GroundDecision]:
     """Decisions of all sources by stamp, independent of source order.
 
     Decisions common to two histories, like a store's and its archive's, count once; repetitions within one history
     count (correct, undo, correct again). Each history keeps its order, even if the site's clock went back.
     """
-    places: dict[tuple[CalibrationDecision, int], tuple[int, int]] = {}
+    places: dict[tuple[GroundDecision, int], tuple[int, int]] = {}
     for history in histories:
-        newest_ns, times = 0, Counter[CalibrationDecision]()
+        newest_ns, times = 0, Counter[GroundDecision]()
         for position, decision in enumerate(history):
             newest_ns = max(newest_ns, decision.stamp_ns)
             times[decision] += 1

@@ -33,11 +33,11 @@ from tests.paths import GOLDEN
 SELECTORS = GOLDEN / "selectors.txt"
 T0 = 1_750_000_000_000_000_000
 FRESH = {"after": 17, "wait_s": 2.5}
-WHEN = {"as_of_ns": T0, "minus_ns": T0 - 10**9, "repairs": True}
+WHEN = {"as_of_ns": T0, "minus_ns": T0 - 10**9}
 RECTANGLE = Bounds(0.0, -3.5, 200.0, 150.0)
 ROADS = {"from_ns": T0, "to_ns": T0 + 10**12, "as_of_ns": T0 + 10**13, "bounds": RECTANGLE, "machine": "loader-1"}
 LINE = ((0.0, 0.0), (30.0, 40.0))
-LATER = {"as_of_ns": T0, "repairs": False, **FRESH}
+LATER = {"as_of_ns": T0, **FRESH}
 
 QUESTIONS = (
     PointQuery(12.0, -40.5),
@@ -54,7 +54,7 @@ QUESTIONS = (
     TilesQuery(MapVersion("0123456789abcdef", 17, 3), place=(-3, 12)),
     TilesQuery(as_of_ns=T0, place=(-3, 12)),
     WhyQuery(12.0, 40.5),
-    WhyQuery(12.0, 40.5, as_of_ns=T0, repairs=True),
+    WhyQuery(12.0, 40.5, as_of_ns=T0),
     SegmentsQuery(),
     SegmentsQuery(**ROADS, **FRESH),
     WorklistQuery(),

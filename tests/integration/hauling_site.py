@@ -13,6 +13,7 @@ from protocol.wire.codec import encode_batch
 from protocol.wire.messages import SampleBatch
 from sitegrid.process.children import Children
 from tests.integration.web_site import WebSite
+from tests.patience import until
 from tests.soak import BATCH_S
 from tests.unit.mapserver.roads.drives import START_NS, along, passes
 
@@ -57,4 +58,5 @@ def hauling_site(folder: Path, children: Children) -> WebSite:
     site.machines = haulers()  # type: ignore[assignment]
     site.drive(DAYS * BATCH_S)
     site.client.ask(WorklistQuery(after=site.client.info().merged))  # roads now include all drives
+    until(lambda: site.client.ask(WorklistQuery()).changes, "the repair of a road in the journal")
     return site

@@ -151,7 +151,7 @@ def tile_planes(tile) -> bytes:
         ("region", {"bounds": "0,0,9000,9000"}, 413, "too_large"),
         ("region", {"polygon": "0,0;9,0;0,9", "bounds": "0,0,9,9"}, 400, "out_of_range"),
         ("region", {"bounds": "0,0,9,9", "resolution": 5, "layers": "heading"}, 400, "out_of_range"),
-        ("region", {"bounds": "0,0,9,9", "repairs": "yes"}, 400, "out_of_range"),
+        ("region", {"bounds": "0,0,9,9", "repairs": 1}, 400, "unknown_parameter"),
         ("point", {"x": 1, "y": 1, "minus": "yesterday"}, 400, "wrong_type"),
         ("tiles", {"store": "x", "row": -1, "fact": 0}, 400, "out_of_range"),
         ("nothing", {}, 404, "not_found"),

@@ -116,7 +116,7 @@ def test_a_change_needs_the_passes_until_the_one_that_showed_it():
     stamps = np.sort(np.concatenate(list(later.values())))
 
     def needed(machines, seen):
-        return TrueRepair(0, stamps, shown_at(later, machines, seen)).needed
+        return TrueRepair(0, stamps, shown_at(later, machines, seen and (seen + 1) * MINUTE_NS)).needed
 
     assert needed(["b"], 11) == 2  # without later drives in that minute
     assert needed(["b"], 19) == 3  # started in that minute, ended later

@@ -47,7 +47,7 @@ with tempfile.TemporaryDirectory() as folder, closing(open_writer(Path(folder)))
     list(warm_up_rest(ServerConfig()))
     before = sorted(ready())
     published = []
-    with closing(Upkeep(writer, published.append, past_of(writer))) as upkeep:
+    with closing(Upkeep(writer, published.append, past_of(writer), answers.roads.repairs)) as upkeep:
         upkeep.calibrate(60.0)
         wait_for(lambda: published and upkeep._checkpointing._looked)  # the last job of a turn has nothing more to do
     line = ((12.0, 10.0), (150.0, 10.0))

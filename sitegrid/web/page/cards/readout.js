@@ -24,8 +24,7 @@ async function showValue(left, top) {
   if (Number.isNaN(map.at(...cell, "visits"))) return hideReadout();
   const { asked: name, std, text } = choices.layer, layers = [name, "resistance_class", ...(std ? [std] : [])].join();
   const [x, y] = cell.map((index) => (index + 0.5) * map.cell_m);
-  const ask = async (as_of) => // with repairs, as tiles are
-    (await getJson(site.path("point"), { x, y, layers, as_of, repairs: as_of ? undefined : 1 })).values;
+  const ask = async (as_of) => (await getJson(site.path("point"), { x, y, layers, as_of })).values;
   const [values, then] = await Promise.all([ask(at), times.isSubtracted ? ask(times.other) : null]);
   const words = (value) => (value === null ? "not measured" : text(value)), value = values[name];
   const was = then ? `${words(then[name])} → ` : "", kind = KINDS[values.resistance_class];

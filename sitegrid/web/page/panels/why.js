@@ -25,7 +25,7 @@ export const follow = () => { isOther = false; };
 
 export async function build(signal) {
   const [x, y] = cell.map((index) => (index + 0.5) * site.map.cell_m), as_of = isOther ? times.other : times.asOf;
-  const why = await getJson(site.path("why"), { x, y, as_of, repairs: as_of ? undefined : 1 }, signal);
+  const why = await getJson(site.path("why"), { x, y, as_of }, signal);
   const edge = (index) => (index * why.cell_m).toFixed(0);
   const where = note(cell.map((index, i) => `${edge(index)} to ${edge(index + 1)} m ${"EN"[i]}`).join(", "));
   if (!why.metres) return [section(say(UNKNOWN), where)];

@@ -15,7 +15,7 @@ import pytest
 from mapserver.calibration.correction import LAST_NS, NO_SHARE, Correction
 from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest import following
-from mapserver.ingest.decisions import KINDS
+from mapserver.ingest.decisions import DECODERS
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
 from mapserver.journal.facts import Facts
@@ -530,7 +530,7 @@ def test_a_decision_of_another_course_is_not_kept(location, standby, database):
     wait_for(lambda: standby.follow(0.1) or standby._replica.facts.excluded == {"c"})
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", DECODERS)
 def test_a_decision_of_another_program_is_named(tmp_path, kind):
     with closing(open_store(tmp_path)) as store:
         store.journal.append_event(kind, 1, {"another": "form"})

@@ -6,7 +6,9 @@ from typing import Any
 
 from mapserver.ingest.writer import Writer
 from mapserver.query.answering import Answers
+from mapserver.query.road_maps import RoadMaps
 from mapserver.query.server_source import ServerSource
+from mapserver.upkeep.road_repairs import RoadRepairs
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import GroundChange
 from protocol.queries.requests import parse_query
@@ -44,7 +46,14 @@ class AnswersOf(Answers):
 
     def __init__(self, writer: Writer, upkeep: FakeUpkeep | None = None) -> None:
         self.writer, self.source = writer, source_of(writer, upkeep)
-        super().__init__(self.source)
+        self.roads = RoadMaps(self.source)
+        super().__init__(self.source, self.roads)
+
+    def examine_roads(self) -> None:
+        """Journal what roads of the newest row and facts show of repairs."""
+        self.roads.reach(self.source.run(lambda state: state.version.row))
+        self.roads.read()
+        RoadRepairs(self.writer, self.roads.repairs).run()
 
 
 def answers_of(writer: Writer, upkeep: FakeUpkeep | None = None) -> AnswersOf:

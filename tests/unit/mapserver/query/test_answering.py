@@ -77,8 +77,8 @@ TOO_MUCH = [
     RegionQuery(Bounds(-45, -45, 45, 45), ("resistance_filled",)),
     PointsQuery(tuple((x + 0.5, -x - 0.5) for x in range(-40, 40, 10)), ("visits",)),
     PointsQuery(PLACES, ("resistance_filled",)),
-    RouteQuery(PLACES, repairs=False),
-    WayQuery(*PLACES, repairs=False),
+    RouteQuery(PLACES),
+    WayQuery(*PLACES),
     CoverageQuery(),
     LanesQuery(),
 ]
@@ -98,7 +98,7 @@ TOO_MUCH_PAST = [
     RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), as_of_ns=THEN_NS),
     RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), minus_ns=THEN_NS),
     PointsQuery(PLACES, ("visits",), as_of_ns=THEN_NS),
-    RouteQuery(PLACES, repairs=False, as_of_ns=THEN_NS),
+    RouteQuery(PLACES, as_of_ns=THEN_NS),
     WorklistQuery(as_of_ns=THEN_NS),
     SegmentsQuery(as_of_ns=THEN_NS),
 ]

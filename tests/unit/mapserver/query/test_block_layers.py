@@ -1,4 +1,4 @@
-"""Kept layers and their answers equal those of a new server, derived again where needed."""
+"""Kept layers and their answers equal those of a new server, derived again where needed, also after a repair."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.writer import Writer
+from mapserver.journal.facts import NO_FACTS
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.block_layers import BlockLayers
@@ -52,7 +53,7 @@ def test_another_grid_begins_anew_and_an_old_look_keeps_nothing(tmp_path):
         expected = read(fresh(), writer, window, names)
 
         class Other:
-            site, config = SITE, CONFIG
+            site, config, facts = SITE, CONFIG, NO_FACTS
             grid = Grid(SITE.cell_m, CONFIG.fold)
             version, newest_ns = old.version, 0
 
@@ -128,18 +129,17 @@ bounds = st.builds(
     *(metres, metres, st.integers(1, 90), st.integers(1, 90)),
 )
 asked = st.one_of(
-    st.builds(PointQuery, metres, metres, names, repairs=st.booleans()),
+    st.builds(PointQuery, metres, metres, names),
     st.builds(
         PointsQuery,
         st.lists(st.tuples(metres, metres), min_size=1, max_size=4).map(tuple),
         names,
-        repairs=st.booleans(),
     ),
-    st.builds(RegionQuery, bounds, names, repairs=st.booleans()),
+    st.builds(RegionQuery, bounds, names),
     st.builds(WhyQuery, metres, metres),
     st.builds(SegmentsQuery, bounds=st.none() | bounds),
     st.builds(WorklistQuery, st.sampled_from([0.01, 0.03])),
-    st.builds(RouteQuery, st.just(ENDS), repairs=st.booleans()),
+    st.builds(RouteQuery, st.just(ENDS)),
     st.just(WayQuery(*ENDS)),
 )
 some = st.tuples(st.just("some"), st.integers(0, 9), st.tuples(metres, metres))
@@ -167,6 +167,7 @@ def test_an_answer_is_that_of_a_server_that_begins_now(course):
             if isinstance(step, tuple):
                 send(writer, [incoming(rows_of(*step, turn), 1, "ab"[turn % 2], spool_id=1 + turn)])
                 continue
+            kept.examine_roads()
             newest = writer.run(lambda store: store.merged)
             words = step.parameters() if isinstance(step, WhyQuery) else {**step.parameters(), "after": str(newest)}
             fresh = answers_of(writer)

@@ -4,7 +4,6 @@ import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ from mapserver.journal.facts import Facts
 from mapserver.journal.location import JournalLocation
 from mapserver.query import road_maps
 from mapserver.query.answering import Answers
-from mapserver.query.block_layers import BlockLayers
-from mapserver.query.map_tiles import Tiles
 from mapserver.query.road_maps import ASKED_S, FRESH_S, RoadMaps
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.map_tiles import PLANES, TilesQuery
@@ -141,6 +138,7 @@ def test_shuffled_and_rebatched_samples_give_the_same_list(tmp_path):
                 for at in range(0, len(own), step):
                     send(opened, [incoming(own[at : at + step], 1 + at, machine=name)])
             answers = answers_of(opened)
+            answers.examine_roads()
             listed = worklist(answers)
             lists.append((segments(answers).segments, listed.rows, listed.changes, drive(answers).totals))
     assert lists[0] == lists[1]
@@ -172,7 +170,6 @@ def test_facts_count_for_samples(writer):
         ("worklist", {"limit": str(MAX_LIMIT + 1)}, "`limit`"),
         ("worklist", {"machine": "a%0Ab"}, "`machine` must be one line"),
         ("segments", {"from": "20", "to": "10"}, "`from` .20. is after `to` .10."),
-        ("point", {"x": "1", "y": "2", "repairs": "yes"}, "`repairs`: 'yes' is neither 0 nor 1"),
     ],
 )
 def test_bad_parameters_are_refused_by_name(name, parameters, problem):
@@ -203,6 +200,8 @@ def test_a_repair_is_told_and_counts(tmp_path):
         assert before.changes == ()
         for machine, rows in good.items():
             send(opened, [incoming(rows, 1 + len(bad[machine]), machine=machine)])
+        assert worklist(answers).changes == (), "not before it is journalled"
+        answers.examine_roads()
         after, now = (worklist(answers, target=target) for target in (0.03, 0.01))
         then = worklist(answers, target=0.03, as_of_ns=int(max(rows["stamp_ns"].max() for rows in bad.values())))
     assert after.rows == ()
@@ -223,6 +222,13 @@ def test_a_repair_is_told_and_counts(tmp_path):
         assert (row.since_ns, row.before, row.saved_kwh_ph) == (change.first_ns, change.before, change.saved_kwh_ph)
 
 
+def shown(answers):
+    """What the newest roads show of repairs."""
+    answers.roads.reach(answers.source.run(lambda state: state.version.row))
+    answers.roads.read()
+    return answers.roads.repairs()
+
+
 BOX = Bounds(36.0, 8.0, 44.0, 13.0)
 
 
@@ -234,41 +240,40 @@ def repaired(tmp_path):
         yield opened, START_NS + 800 * 10**9
 
 
-def resistance(answers, *, repairs, as_of_ns=None):
-    return answers.region(RegionQuery(BOX, ("resistance",), as_of_ns=as_of_ns, repairs=repairs)).layers["resistance"]
+def resistance(answers, as_of_ns=None):
+    return answers.region(RegionQuery(BOX, ("resistance",), as_of_ns=as_of_ns)).layers["resistance"]
 
 
 def test_a_found_change_begins_a_new_age_of_its_cells(repaired):
     opened, then_ns = repaired
     answers = answers_of(opened)
-    plain, since = (resistance(answers, repairs=repairs) for repairs in (False, True))
+    plain = resistance(answers)
+    answers.examine_roads()
+    since = resistance(answers)
     driven, again = np.isfinite(plain), np.isfinite(since)  # some only touched since: unknown
     assert again.sum() > driven.sum() / 2
     assert not (again & ~driven).any()
     assert plain[driven].max() > 0.03  # old and new samples mixed: too narrow a strip for a change of cells
     assert since[again] == pytest.approx(0.02, rel=0.2)
-    np.testing.assert_array_equal(resistance(answers_of(opened), repairs=True), since)  # as after a restart
-    before = resistance(answers, repairs=True, as_of_ns=then_ns)
+    np.testing.assert_array_equal(resistance(answers_of(opened)), since)  # as after a restart
+    before = resistance(answers, then_ns)
     assert before[again] == pytest.approx(0.06, rel=0.2)
-    np.testing.assert_array_equal(before, resistance(answers, repairs=False, as_of_ns=then_ns))
-    newest = max(int(passes(LINE, 3, 0.02, after_s=930.0)["stamp_ns"].max()), 0)
-    np.testing.assert_array_equal(resistance(answers, repairs=True, as_of_ns=newest), since)
-    point = answers.point(PointQuery(40.0, 10.0, ("resistance",), repairs=True))
+    newest = opened.run(lambda store: store.newest_ns)
+    np.testing.assert_array_equal(resistance(answers, newest), since)
+    point = answers.point(PointQuery(40.0, 10.0, ("resistance",)))
     assert point.values["resistance"] == pytest.approx(0.02, rel=0.2)
-    assert point.merged == worklist(answers).merged
+    assert (point.merged, point.version.fact) == (worklist(answers).merged, worklist(answers).fact)
 
 
-def test_reasons_are_of_the_value_that_is_read_with_repairs(repaired):
+def test_reasons_are_of_the_value_that_is_read(repaired):
     opened, then_ns = repaired
     answers = answers_of(opened)
-    now, plain, then = (
-        answers.why(WhyQuery(40.0, 10.0, as_of_ns=as_of_ns, repairs=repairs))
-        for as_of_ns, repairs in ((None, True), (None, False), (then_ns, True))
-    )
-    for repairs, reasons in ((True, now), (False, plain)):
-        point = answers.point(PointQuery(40.0, 10.0, ("resistance", "visits"), repairs=repairs))
-        assert {name: reasons.values[name] for name in point.values} == pytest.approx(point.values)
-        assert reasons.merged == point.merged
+    plain = answers.why(WhyQuery(40.0, 10.0))
+    answers.examine_roads()
+    now, then = (answers.why(WhyQuery(40.0, 10.0, as_of_ns=as_of_ns)) for as_of_ns in (None, then_ns))
+    point = answers.point(PointQuery(40.0, 10.0, ("resistance", "visits")))
+    assert {name: now.values[name] for name in point.values} == pytest.approx(point.values)
+    assert (now.merged, now.fact) == (point.merged, point.version.fact)
     assert now.before["resistance"] == pytest.approx(0.06, rel=0.2)
     assert now.changed_ns > then_ns
     assert np.sum(now.resistance.votes) + np.sum(now.resistance.before) == pytest.approx(np.sum(plain.resistance.votes))
@@ -283,7 +288,9 @@ def drive(answers, line=((15.0, 10.0), (205.0, 10.0)), **more):
 def test_a_route_is_of_the_road_as_it_is_since_its_repair(repaired):
     opened, then_ns = repaired
     answers = answers_of(opened)
-    since, plain, then = drive(answers), drive(answers, repairs=False), drive(answers, as_of_ns=then_ns)
+    plain = drive(answers)
+    answers.examine_roads()
+    since, then = drive(answers), drive(answers, as_of_ns=then_ns)
     assert since.steps.resistance == pytest.approx(0.02, rel=0.1)
     assert then.steps.resistance == pytest.approx(0.06, rel=0.1)
     assert since.totals.energy_j < 0.8 * plain.totals.energy_j
@@ -293,26 +300,22 @@ def test_a_route_is_of_the_road_as_it_is_since_its_repair(repaired):
     assert cheapest.totals.energy_j == pytest.approx(since.totals.energy_j, rel=0.05)
 
 
-def layers_of(source):
-    return BlockLayers(source.site.cell_m, source.config)
-
-
-def test_tiles_show_a_repair_with_the_next_row(repaired):
+def test_tiles_show_a_repair_once_it_is_journalled_and_no_others_are_sent(repaired):
     opened, _ = repaired
-    source, ages = source_of(opened), {}
-    tiles = Tiles(source, layers_of(source), lambda: dict(ages))
-    first = tiles.answer(TilesQuery())
-    ages |= RoadMaps(source).read().ages
-    assert tiles.answer(TilesQuery(first.version)).tiles == (), "who has this row would not ask for it"
-    send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine="c")])
-    later = {(tile.x, tile.y): tile for tile in tiles.answer(TilesQuery(first.version)).tiles}
+    send(opened, [incoming(passes(along([(300, 300), (380, 300)]), 1), machine="c")])
+    answers = answers_of(opened)
+    first = answers.tiles(TilesQuery())
+    answers.examine_roads()
+    later = {(tile.x, tile.y): tile for tile in answers.tiles(TilesQuery(first.version)).tiles}
     before = {(tile.x, tile.y): tile for tile in first.tiles}
     row = 10, slice(36, 44)
     resistance = PLANES["resistance"].values()
     assert resistance[before[0, 0].unpacked()["resistance"]][row].max() > 0.03
     assert resistance[later[0, 0].unpacked()["resistance"]][row] == pytest.approx(0.02, rel=0.2)
-    fresh = Tiles(source, layers_of(source), lambda: dict(ages)).answer(TilesQuery())
-    assert {(tile.x, tile.y): tile.planes for tile in fresh.tiles}[0, 0] == later[0, 0].planes
+    assert before.keys() - later.keys(), "the new row's are those of then"
+    assert {tile.row for tile in later.values()} == {5}
+    fresh = {(tile.x, tile.y): tile.planes for tile in answers_of(opened).tiles(TilesQuery()).tiles}
+    assert fresh == {place: tile.planes for place, tile in (before | later).items()}
 
 
 def come(opened, machine="c"):
@@ -350,11 +353,8 @@ def test_roads_are_those_of_the_last_seconds_and_say_which(repaired, look_s, old
     assert roads.read() is second, "nothing came in since, however long ago"
 
 
-WHOLE = RouteQuery(((15.0, 10.0), (205.0, 10.0)))
-
-
-def row_of(answers: Answers, query: RouteQuery) -> int:
-    return decode_answer(answers.answer(query)).version.row
+def row_of(answers: Answers, query: SegmentsQuery) -> int:
+    return decode_segments(answers.answer(query)).merged
 
 
 @pytest.fixture
@@ -362,7 +362,7 @@ def slow(repaired, monkeypatch):
     """Answers whose newer, awaited roads are in the making until an event is set."""
     opened, _ = repaired
     answers, may_end, began = answers_of(opened), threading.Event(), threading.Event()
-    assert row_of(answers, WHOLE) == 4
+    assert row_of(answers, SegmentsQuery()) == 4
     whole = road_maps.network
 
     def slowly(skeleton):
@@ -374,7 +374,7 @@ def slow(repaired, monkeypatch):
     monkeypatch.setattr(road_maps, "CHEAP", DEAR)
     come(opened)
     with ThreadPoolExecutor(4) as pool:
-        waiting = [pool.submit(row_of, answers, replace(WHOLE, after=5)) for _ in range(4)]
+        waiting = [pool.submit(row_of, answers, SegmentsQuery(after=5)) for _ in range(4)]
         assert began.wait(PATIENCE_S)
         yield answers, may_end, waiting
         may_end.set()
@@ -382,14 +382,16 @@ def slow(repaired, monkeypatch):
 
 def test_roads_in_the_making_hold_up_nobody_and_who_waits_for_them_takes_them(slow, monkeypatch):
     answers, may_end, waiting = slow
-    assert row_of(answers, WHOLE) == row_of(answers, WHOLE) == 4
-    assert row_of(answers, replace(WHOLE, repairs=False)) == 5
+    assert row_of(answers, SegmentsQuery()) == row_of(answers, SegmentsQuery()) == 4
+    assert drive(answers).version.row == 5
     with monkeypatch.context() as patched:
         patched.setattr(road_maps, "FRESH_S", -1.0)  # stale at once
-        assert answers.tiles(TilesQuery()).version.row == 5, "a picture goes without them"
+        patched.setattr(road_maps, "COSTLY", 0)
+        assert answers.roads.repairs() is None
+        assert answers.tiles(TilesQuery()).version.row == 5
     may_end.set()
     assert [one.result(PATIENCE_S) for one in waiting] == [5] * 4
-    assert row_of(answers, WHOLE) == 5
+    assert row_of(answers, SegmentsQuery()) == 5
 
 
 def test_roads_are_made_beside_while_somebody_asks(repaired):
@@ -460,18 +462,17 @@ def test_a_fact_between_two_passes_is_no_repair(tmp_path, facts):
     with closing(open_writer(tmp_path)) as opened:
         deliver(opened, parts[:1])
         answers = answers_of(opened)
-        assert worklist(answers).changes == ()
+        answers.examine_roads()
         opened.run(lambda store: setattr(store, "facts", facts))
-        assert worklist(answers).changes == ()
+        assert shown(answers) is None
         first = {name: 1 + len(rows) for name, rows in parts[0].items()}
         send(opened, [incoming(rows, first[name], machine=name) for name, rows in parts[1].items()])
+        assert shown(answers) is None
         listed = worklist(answers)
         known = {one.id: one.resistance for one in segments(answers).segments}
-        plain, since = (resistance(answers, repairs=repairs) for repairs in (False, True))
     assert listed.changes == ()
     assert all(row.before is None and row.saved_kwh_ph is None for row in listed.rows)
     assert known["3_0_e"] == pytest.approx(0.04, rel=0.05)
-    np.testing.assert_array_equal(plain, since)
 
 
 def test_days_of_a_row_are_its_history(tmp_path):
@@ -507,7 +508,9 @@ def test_burned_litres_stand_beside_predicted_ones_in_the_list_and_at_changes(tm
     worse["fuel_l"] = 0.5 * 40_000 * 9.80665 * worse["c_rr"] / (0.4 * 35.8e6)
     with closing(open_writer(tmp_path)) as opened:
         deliver(opened, [{"a": worse, "b": rows_of()["b"]}])
-        answer = worklist(answers_of(opened))
+        answers = answers_of(opened)
+        answers.examine_roads()
+        answer = worklist(answers)
     fuels = {row.segment.id: row.segment.fuel for row in answer.rows}
     burning = [fuel for fuel in fuels.values() if fuel]
     assert 0 < len(burning) < len(fuels)

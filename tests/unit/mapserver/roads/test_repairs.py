@@ -6,7 +6,8 @@ import pytest
 from mapserver.evidence.fold_config import name_hash
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.passes import PassTally
-from mapserver.roads.repairs import TUNING, Repair, ages, repairs
+from mapserver.roads.repair_facts import NO_REPAIRS
+from mapserver.roads.repairs import TUNING, Repair, Strips, repairs, since
 from tests.unit.mapserver.roads.drives import START_NS, along, passes, roads
 
 LINE = along([(10, 10), (110, 10)])
@@ -70,8 +71,9 @@ def test_a_change_is_seen_once_passes_agree(values, machines, minutes):
     for each in repaired:
         assert each.before == pytest.approx(np.mean(values[:begins]), rel=0.1)
         assert each.after == pytest.approx(np.mean(values[begins:]), rel=0.1)
-        assert minutes[0] <= each.seen - each.minute <= minutes[1]
-        assert each.minute == pytest.approx(START_NS // MINUTE_NS + 2.5 * begins, abs=2)
+        assert minutes[0] <= (each.seen_ns - each.first_ns) / MINUTE_NS - 1 <= minutes[1]
+        assert each.first_ns / MINUTE_NS == pytest.approx(START_NS // MINUTE_NS + 2.5 * begins, abs=2)
+        assert each.known_ns / MINUTE_NS == pytest.approx(START_NS // MINUTE_NS, abs=1)
 
 
 @pytest.mark.parametrize(
@@ -91,9 +93,15 @@ def test_what_is_no_change(values, machines):
 
 
 def test_a_second_change_is_compared_with_what_came_after_the_first():
-    repaired, _ = shown(fleet([0.06] * 6 + [0.03] * 6 + [0.06] * 3, noise=0.001))
+    machines = fleet([0.06] * 6 + [0.03] * 6 + [0.06] * 3, noise=0.001)
+    repaired, _ = shown(machines)
     one = [each for each in repaired if each.segment == 1]
     assert [round(each.after, 2) for each in one] == [0.03, 0.06]
+    assert one[1].known_ns == one[0].first_ns
+    passed = tally_of(machines).passes(Ledgers(roads(*machines.values())))
+    later, _ = repairs(since(passed, one[:1]))
+    assert [each for each in later if each.segment == 1] == one[1:], "as if the earlier passes were forgotten"
+    assert [each for each in later if each.segment == 2] == [each for each in repaired if each.segment == 2]
 
 
 def test_ground_that_wears_is_compared_with_the_newest_passes():
@@ -101,7 +109,7 @@ def test_ground_that_wears_is_compared_with_the_newest_passes():
     worn = [0.02 * 1.005**i for i in range(2 * TUNING.most_known)]
     repaired, looks = shown(fleet([*worn, 0.014, 0.014], noise=0.0))
     assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
-    assert all(each.minute > START_NS // MINUTE_NS + 150 * len(worn) // 60 - 3 for each in repaired)
+    assert all(each.first_ns // MINUTE_NS > START_NS // MINUTE_NS + 150 * len(worn) // 60 - 3 for each in repaired)
     assert looks == 5 * (len(worn) + 2 - TUNING.least_known - TUNING.least_agree + 1)
 
 
@@ -121,7 +129,10 @@ def test_a_change_begins_an_age_of_the_cells_of_its_segment_alone(cell_m):
     segments = roads(passes(LINE), passes(beside, seed=1))
     at = segments.ids.index("2_0_e") if "2_0_e" in segments.ids else segments.ids.index("2_0_e.1")
     line = segments.line(at)
-    places, begins = cells_of(ages(segments, [Repair(at, minute, 11, 0.04, 0.02) for minute in (10, 5)], cell_m))
+    strips, minutes = Strips(segments, cell_m), [at_minute * MINUTE_NS for at_minute in (10, 5)]
+    located = strips.located([Repair(at, 1, first_ns, first_ns + 1, 0.04, 0.02) for first_ns in minutes], 2**60)
+    assert [repair.segment for repair in strips.placed(located)] == [at, at]
+    places, begins = cells_of(NO_REPAIRS.after(located).ages)
     middles = (places + 0.5) * cell_m
     assert set(begins.tolist()) == {10 * MINUTE_NS}, "of the newest change"
     assert np.abs(middles[:, 1] - line[:, 1].mean()).max() <= 3.5

@@ -148,7 +148,7 @@ def folded(upkeep: Upkeep, writer: Writer) -> Grid:
 def test_asked_for_the_map_has_what_is_known_at_once(writer):
     deliver(writer)
     before = writer.run(grid_copy)
-    with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
+    with closing(Upkeep(writer, lambda _: None, past_of(writer), lambda: None)) as site:
         assert site.calibration().machines[0].spans == ()
         site.calibrate(PATIENCE_S)
         answer = site.calibration()
@@ -169,7 +169,7 @@ def test_asked_for_the_map_has_what_is_known_at_once(writer):
 
 def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
     deliver(writer)
-    with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
+    with closing(Upkeep(writer, lambda _: None, past_of(writer), lambda: None)) as site:
         site.correct(CalibrateCommand("a", zero=0.0081234, reason="levelled", wait_s=60.0))
         state = site.calibration().machines[0]
         assert (state.by, state.reason, state.spans[0].zero, state.spans[0].from_ns) == (
@@ -195,7 +195,7 @@ def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
 def test_by_itself_it_corrects_machines_unless_it_must_not(tmp_path, automatic, machines):
     config = ServerConfig(store=StoreConfig(archive_after_h=0.0), calibration=CalibrationConfig(automatic))
     with closing(open_writer(tmp_path, config)) as writer:
-        site = Upkeep(writer, lambda _: None, past_of(writer))
+        site = Upkeep(writer, lambda _: None, past_of(writer), lambda: None)
         with closing(site):
             for share in range(4):
                 deliver(writer, share / 4, (share + 1) / 4)

@@ -56,7 +56,7 @@ class Site:
             calibration=CalibrationConfig(automatic=calibrates),
         )
         self.writer = open_writer(folder, self.config)
-        self.upkeep = Upkeep(self.writer, self.published.append, past_of(self.writer))
+        self.upkeep = Upkeep(self.writer, self.published.append, past_of(self.writer), lambda: None)
 
     @property
     def grid(self) -> Grid:

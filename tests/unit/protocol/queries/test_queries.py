@@ -31,7 +31,7 @@ from tests.unit.records import STORE, site_info, version
 positions = st.floats(-1e15, 1e15)
 layers = st.lists(st.sampled_from(["resistance", "grade_east", "age_s"]), max_size=3).map(tuple)
 stamps = st.none() | st.integers(1, MAX_STAMP_NS)
-when = {"as_of_ns": stamps, "minus_ns": stamps, "repairs": st.booleans()}
+when = {"as_of_ns": stamps, "minus_ns": stamps}
 freshness = {"after": st.integers(1, 10**15), "wait_s": st.floats(0, 60)}
 
 

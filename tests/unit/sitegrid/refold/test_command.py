@@ -19,6 +19,7 @@ from mapserver.calibration.decide import CalibrationDecisions
 from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
+from mapserver.ingest.decisions import ground_decisions
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, archive
@@ -26,6 +27,7 @@ from mapserver.journal.history import history_rows
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.rows import JournalRow
 from mapserver.journal.sqlite.reader import SqliteReader
+from mapserver.roads.repair_facts import RoadRepair
 from protocol.arrays import Table
 from protocol.config import from_table
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
@@ -207,13 +209,28 @@ def test_corrections_are_beside_the_files_of_an_archive_too(tmp_path: Path):
         assert same_evidence(plain_store.grid, folded())
 
 
+def test_repairs_of_roads_go_with_a_store_and_beside_the_files_of_an_archive(tmp_path: Path):
+    source = make_store(tmp_path / "source", archived=9)
+    repair = RoadRepair("3_0_e", T0, T0 + 1, T0 + 2, 0.06, 0.02, 1.0, ((1, -2, "0f" * 32),), T0 + 3)
+    with closing(Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns)) as opened_store:
+        opened_store.decide(*FACTS, repair)
+        archived_decisions.save(source / FOLDER, opened_store.identity.id, ground_decisions(opened_store.journal))
+    for number, words in enumerate(((source,), (source / FOLDER,), (source, source / FOLDER))):
+        assert run(*words, "--out", tmp_path / f"new-{number}") == 0
+        with closing(opened(tmp_path / f"new-{number}")) as new:
+            assert (new.facts.repairs.standing, new.fact) == ({repair.key: repair}, 4)
+    assert run(source, "--out", tmp_path / "finer", "--cell", 0.5) == 0
+    with closing(opened(tmp_path / "finer")) as finer:
+        assert not finer.facts.repairs.standing, "they are of cells of 1 m"
+
+
 def test_damaged_corrections_of_an_archive_are_not_folded_without(tmp_path: Path, capsys):
     source = make_store(tmp_path / "source", archived=9)
     decide(source)
     path = source / FOLDER / archived_decisions.FILE
     path.write_text(path.read_text().replace("0.02", "0.03"))
     assert run(source / FOLDER, "--out", tmp_path / "new") == 1
-    assert "calibration.json: is damaged" in capsys.readouterr().err
+    assert "decisions.json: is damaged" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
