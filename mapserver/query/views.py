@@ -152,8 +152,11 @@ def read_cells(
 def read_lanes(
     view: View, window: CellWindow | None, since_ns: int | None, cell_m: float, config: ServerConfig
 ) -> LanesAnswer:
-    """Lanes of the blocks in a window, or all (None). since_ns: only those with newer samples."""
-    first = valid_pages(view.pages, cell_m, config.change, view.ages)
+    """Lanes of the blocks in a window, or all (None). since_ns: only those with newer samples.
+
+    Also of before a repair: it moves no road.
+    """
+    first = valid_pages(view.pages, cell_m, config.change)
     blocks = [block for block in sorted(view.pages) if window is None or _touches(block, window)]
     tiles = (lane_tile(block, view.pages[block], first[block], view.stamp_ns) for block in blocks)
     known = tuple(tile for tile in tiles if tile and (since_ns is None or tile.newest_ns > since_ns))

@@ -113,10 +113,12 @@ def site(tmp_path: Path) -> Iterator[Site]:
 
 def test_a_repair_is_journalled_once_and_moves_no_grid(site: Site):
     grid, plain = site.writer.run(lambda store: store.grid), site.resistance()
+    lanes = [tile.metres for tile in site.answers.lanes(LanesQuery()).tiles]
     site.answers.examine_roads()
     events, read = site.events(), site.resistance()
     assert len({event.segment for event in events}) == len(events) >= 3
     assert not np.array_equal(plain, read, equal_nan=True)
+    np.testing.assert_array_equal([tile.metres for tile in site.answers.lanes(LanesQuery()).tiles], lanes)
     version = site.writer.run(lambda store: store.version)
     assert (version.row, version.fact) == (4, len(events))
     site.answers.examine_roads()
