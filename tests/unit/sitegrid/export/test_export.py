@@ -23,6 +23,8 @@ from pyproj import CRS, Transformer
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform
 
+from mapserver.ingest.decisions import ground_decisions
+from mapserver.journal import archived_decisions
 from mapserver.journal.rows import JournalRow
 from protocol.queries.requests import InfoQuery, RegionQuery
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
@@ -33,6 +35,8 @@ from sitegrid.commands.export import FORMS as OPTIONS
 from sitegrid.export import maps
 from sitegrid.export.command import FEATURES, FORMS
 from tests.integration.hauling_site import haulers
+from tests.unit.mapserver.data import open_writer
+from tests.unit.mapserver.query.fake_upkeep import answers_of
 from tests.unit.sitegrid.refold.archives import SITE, write
 
 pytestmark = [
@@ -45,10 +49,14 @@ FILES = {suffix: f"map{suffix}" if form.usual else f"{form.holds[-2]}{suffix}" f
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive of haulers on three roads, one repaired."""
-    folder = tmp_path_factory.mktemp("archive")
+    """An archive of haulers on three roads, one repaired, and its server's decisions."""
+    folder, first = tmp_path_factory.mktemp("archive"), tmp_path_factory.mktemp("first") / "store"
     rows = [(one.name, table) for one in haulers() for table in one._days]
     write(folder, [JournalRow(i, name, 7, 1 + 10_000 * i, table, 1) for i, (name, table) in enumerate(rows, 1)])
+    assert main(["fold", str(folder), "--out", str(first)]) == 0
+    with closing(open_writer(first)) as writer:
+        answers_of(writer).examine_roads()
+        archived_decisions.save(folder, writer.store_id, writer.run(lambda store: ground_decisions(store.journal)))
     return folder
 
 
