@@ -138,6 +138,6 @@ def pieces(history: Iterable[JournalRows], selection: Selection) -> Generator[Sa
 
 
 def release_memory() -> None:
-    """Return memory freed by a fold to the system; the C library keeps it per thread."""
+    """Return memory freed by a fold, or by making roads, to the system; the C library keeps it per thread."""
     with suppress(OSError, AttributeError):  # only glibc has it
         ctypes.CDLL(None).malloc_trim(0)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.journal.facts import NO_FACTS, Facts
+from mapserver.journal.history import release_memory
 from mapserver.journal.rows import Selection
 from mapserver.query.source import MapReading, MapState
 from mapserver.query.views import check_past
@@ -278,6 +279,7 @@ class RoadMaps:
         _ = roads.changes  # here rather than in the first query
         from_ns = _first_hour(newest_ns) * HOUR_NS
         passes = self._traffic.passes.passes(ledgers, from_ns)
+        release_memory()
         took_s = self._clock() - looked_s
         self._newest = _Newest(roads, looked_s, took_s, passes, max(from_ns, self._traffic.passes.since_ns))
         self.made, self.made_s = self.made + 1, self.made_s + took_s
