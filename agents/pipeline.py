@@ -39,7 +39,7 @@ _stamp = attrgetter("stamp_ns")
 
 
 class Pipeline:
-    """Localisation, ground estimation and sampling of one machine."""
+    """Localisation, ground estimation and sampling of one machine. positioning: locates it."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class Pipeline:
         """Start, with the ground estimator's earlier `calibration`."""
         self._site, self._machine, self._tuning = site, in_name_order(machine), tuning
         self._config, self._smooths = config, config.localisation.smoothing_s > 0
-        self._positioning = Positioning(site, machine, config)
+        self.positioning = Positioning(site, machine, config)
         self._counters: Counter[str] = Counter()
         self._newest_ns = self._looked_ns = 0
         self._clocks, self._offsets = ClockOffsets(machine, site, CLOCKS_S), list[Offset]()
@@ -61,15 +61,15 @@ class Pipeline:
     @property
     def pose(self) -> PoseBelief | None:
         """The newest pose, None until the heading is known."""
-        return self._positioning.pose
+        return self.positioning.pose
 
     def pose_at(self, stamp_ns: int) -> PoseBelief | None:
         """Pose at a recent stamp, or None."""
-        return self._positioning.pose_at(stamp_ns)
+        return self.positioning.pose_at(stamp_ns)
 
     def slow_error_m(self, receiver: str) -> Floats:
         """Estimated slow error of a receiver (2,), east and north [m]."""
-        return self._positioning.slow_error_m(receiver)
+        return self.positioning.slow_error_m(receiver)
 
     @property
     def pending(self) -> int:
@@ -79,13 +79,13 @@ class Pipeline:
     def step(self, readings: Sequence[Reading]) -> Samples:
         """Process readings in stamp order; returns the samples they allow."""
         self._clocks.take(readings)
-        return joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
+        return joined([made for reading in readings for made in self._take(self.positioning.accept(reading))])
 
     def settle(self) -> Samples:
         """Final samples of all known so far, as no reading may come for long."""
-        rest = self._take(self._positioning.finish())
-        proven = self._place(self._positioning.conclude())
-        return joined([*rest, *proven, self._settle(self._positioning.remaining())])
+        rest = self._take(self.positioning.finish())
+        proven = self._place(self.positioning.conclude())
+        return joined([*rest, *proven, self._settle(self.positioning.remaining())])
 
     def finish(self) -> Samples:
         """The same at the end of the stream; what has no position is counted."""
@@ -96,7 +96,7 @@ class Pipeline:
     @property
     def lanes(self) -> LaneAid | None:
         """Lanes of the shared map; None if unused."""
-        return self._positioning.lanes
+        return self.positioning.lanes
 
     def consider(self, offer: Any) -> None:
         """Judge a calibration offer of the map server."""
@@ -109,7 +109,7 @@ class Pipeline:
 
     def health(self) -> dict[str, Any]:
         """State of the stages in plain values."""
-        pose, localiser = self.pose, self._positioning.localiser
+        pose, localiser = self.pose, self.positioning.localiser
         std_m = float(np.sqrt(np.linalg.eigvalsh(pose.covariance_m2)[-1])) if pose else None
         return {
             "aligned": localiser.is_aligned,
@@ -119,7 +119,7 @@ class Pipeline:
             "faults": self.faults,
             "position_std_m": std_m,
             "speed_mps": pose.speed_mps if pose else None,
-            "counters": dict(self._counters + self._positioning.counters),
+            "counters": dict(self._counters + self.positioning.counters),
             "withheld": dict(self._sampler.withheld),
             "without_resistance": dict(self._sampler.without_resistance),
             "ground": self._estimator.health(),
@@ -130,13 +130,13 @@ class Pipeline:
     @property
     def faults(self) -> dict[str, str]:
         """Sensor faults, a sentence by sensor."""
-        return self._positioning.faults
+        return self.positioning.faults
 
     def clocks(self) -> str:
         """Sensors whose clocks differ, and what to do; or empty."""
         if abs(self._newest_ns - self._looked_ns) > LOOK_NS:
             self._looked_ns, self._offsets = self._newest_ns, self._clocks.find()
-        refused = self._clocks.named({name: (ahead_s, 0.0) for name, ahead_s in self._positioning.clocks_s.items()})
+        refused = self._clocks.named({name: (ahead_s, 0.0) for name, ahead_s in self.positioning.clocks_s.items()})
         named = {offset.sensor for offset in refused}
         sentences = [offset.sentence(is_refused=True) for offset in refused]
         return "; ".join(sentences + [o.sentence() for o in self._offsets if o.sensor not in named])
@@ -154,12 +154,12 @@ class Pipeline:
             self._count_withheld()
             self._start(self._estimator.calibration)
         for pose in poses:
-            self._positioning.poses.append(pose)
-        if self._positioning.localiser.is_proven:
+            self.positioning.poses.append(pose)
+        if self.positioning.localiser.is_proven:
             made += self._place(poses)
         stamp_ns = readings[0][0].stamp_ns
         self._newest_ns = stamp_ns if restarts else max(self._newest_ns, stamp_ns)  # a clock may be set back
-        dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
+        dead_reckoning, belief = self.positioning.dead_reckoning, self.positioning.localiser.belief
         speed_mps, known_c_rr, newest = float(belief.x[SPEED]) if belief else None, self._known_c_rr(), self.pose
         if mass_kg := self._estimator.estimated_mass_kg:
             dead_reckoning.mass_kg = mass_kg
@@ -188,6 +188,8 @@ class Pipeline:
         rows = self._sampler.due_samples(self._newest_ns, self._estimator.at)
         if not len(rows):
             return []
+        if self.lanes:
+            self.lanes.feel(rows)
         return [Samples(rows, NOTHING if self._smooths else self._sampler.final_samples(lambda pose: pose))]
 
     def _settle(self, remaining: Sequence[SmoothedPose], off_m: float = 0.0) -> Samples:
@@ -225,7 +227,7 @@ class Pipeline:
         """Start with nothing but the calibration, as after power-up or a clock jump."""
         config, machine = self._config, self._machine
         self._estimator = GroundEstimator(machine, config.estimation, known, self._tuning)
-        self._sampler, self._watch = Sampler(machine.load_centre_m), self._positioning.localiser.watch
+        self._sampler, self._watch = Sampler(machine.load_centre_m), self.positioning.localiser.watch
         self._sampler.is_clear = lambda stamp_ns: not self._watch.off_m(stamp_ns)
         self._odometer = Odometer()
         self._track = SmoothedTrack()

@@ -19,7 +19,7 @@ from agents.localisation.fix import Fix
 from agents.localisation.gps import Receivers, drifting
 from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep
-from agents.localisation.lanes.aid import LANES, LaneAid
+from agents.localisation.lanes.aid import LaneAid
 from agents.localisation.measurements import PLACE
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
@@ -197,10 +197,14 @@ class Tracker:
         if aid.lanes and not fusion.model.layout.lanes:
             layout = replace(fusion.model.layout, lanes=True)
             fusion.extend(replace(fusion.model, layout=layout), aid.variances_m2(reckoned.stamp_ns))
-        measurement, layout = aid.measurement(fusion.belief), fusion.model.layout
-        beliefs = fusion.add([measurement]) if measurement else []
-        if beliefs and not aid.judge(fusion.belief, fusion.last[LANES].nis, layout):
-            self._doubt = partial(aid.taken_back, layout=layout)
+        layout = fusion.model.layout
+        beliefs: list[Belief] = []
+        for measure in (aid.measurement, aid.slope_measurement):
+            if not (measurement := measure(fusion.belief)) or not (changed := fusion.add([measurement])):
+                continue
+            beliefs += changed
+            if not aid.judge(fusion.belief, fusion.last[measurement.sensor].nis / len(measurement.z), layout):
+                self._doubt = partial(aid.taken_back, layout=layout)
         return beliefs
 
     def _place(self, fusion: Fusion, event: Fix | Measurement) -> list[Belief]:

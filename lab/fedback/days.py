@@ -36,6 +36,7 @@ SITES = {
         Site("driven", "paper_site_driven", "paper_shared", routes=("west", "east", "middle")),
         Site("loading", "loading", "dgps", routes=("west", "east", "middle", "yard")),
         Site("haul", "haul_road_driven", "dgps_shared", "dump_truck", 8.0, routes=("haul",)),
+        Site("slopes", "haul_road_undulating", "dgps_shared", "dump_truck", 8.0, routes=("haul",)),
         Site("free", "paper_site_driven", "paper_shared"),
         Site("crossings", "paper_site_driven", "paper_shared"),
         Site("two", "paper_site_driven", "paper_shared"),

@@ -24,6 +24,7 @@ from protocol.errors import ConfigError
 from sitegrid.proof.figures import Report, Row, rounded
 
 SETTLED_S = 60.0  # judged afterwards
+SLOPED = ("mature", "lanes", "reshaped", "turned", "east2", "left3")  # maps of ground that undulates
 REPEATED = ("loading", "haul", "two", "both", "crossings", "free")
 
 
@@ -45,7 +46,8 @@ class FedbackCase:
 
 
 CASES = (
-    *(FedbackCase("driven", name) for name in MAPS),
+    *(FedbackCase("driven", name) for name in MAPS if name not in ("reshaped", "turned")),
+    *(FedbackCase("slopes", name) for name in SLOPED),
     FedbackCase("driven", "mature", receivers=1),
     *(FedbackCase(site, "mature") for site in REPEATED),
     FedbackCase("driven", "row"),
@@ -111,7 +113,7 @@ def figures_of_day(case: FedbackCase, first: Drives, second: Drives, seconds: fl
     without = {name: rerun(nodes, lambda _: None, aids=False) for name, nodes in second.items()}
     for _ in range(math.ceil(seconds / READ_S) if young else 1):
         maps_of = MAPS[case.map](Scene(rows, own, begin_ns, seconds))
-        aided = {name: rerun(nodes, maps_of(name), young=young) for name, nodes in second.items()}
+        aided = {name: rerun(nodes, maps_of(name)) for name, nodes in second.items()}
         own = [(name, placed_again(nodes, without[name], aided[name])) for name, nodes in second.items()]
     figures = _compared(second, without, aided)
     return figures, sum((course.counts for course in aided.values()), Counter[str]())
@@ -135,7 +137,7 @@ def _row_of_days(days: Sequence[Drives]) -> list[Row]:
         lanes = lane_map(known) if known else None
         maps: Maps = lambda _, lanes=lanes: lanes  # type: ignore[misc] # noqa: E731
         without = {name: rerun(nodes, lambda _: None, aids=False) for name, nodes in drives.items()}
-        aided = {name: rerun(nodes, maps, young=False) for name, nodes in drives.items()} if known else without
+        aided = {name: rerun(nodes, maps) for name, nodes in drives.items()} if known else without
         figures = _compared(drives, without, aided)
         ratios = {
             f"{what}_ratio": float(np.sqrt(figures[f"{what}_m2"].mean() / figures[f"without_{what}_m2"].mean()))

@@ -1,4 +1,4 @@
-"""Lane maps by the map server's fold and layer, some harmful: displaced or unrepeated lanes."""
+"""Lane maps by the map server's fold and layer, some harmful: displaced or unrepeated lanes, ground shaped anew."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from agents.localisation.lanes.lane_map import LaneMap
+from agents.sampling import EVERY_M
 from lab.fedback.days import SITES, free_ways
 from lab.fedback.rerun import Maps
 from mapserver.config import ServerConfig
@@ -57,6 +58,17 @@ def turned(rows: Rows) -> Rows:
         table = table.copy()
         table["heading_rad"] = (table["heading_rad"] + 2 * np.pi) % (2 * np.pi) - np.pi
         out.append((f"{name}-back", table))
+    return out
+
+
+def reshaped(rows: Rows, by_m: float = 100.0) -> Rows:
+    """Slopes of places by_m further along each machine's way: other ground, as rough; NaN: none, so lanes alone."""
+    out = []
+    for name, table in rows:
+        table = table.copy()
+        for column in ("grade_e", "grade_n"):
+            table[column] = np.roll(table[column], round(by_m / EVERY_M)) if np.isfinite(by_m) else np.nan
+        out.append((name, table))
     return out
 
 
@@ -169,6 +181,9 @@ MAPS: dict[str, Callable[[Scene], MapsOf]] = {
     "two6": lambda scene: scene.still([*scene.rows, *renamed(moved(scene.rows, 6.0), "-two")]),
     "only6": lambda scene: scene.still(moved(scene.rows, 6.0)),
     "both": lambda scene: scene.still([*scene.rows, *turned(moved(scene.rows, 1.0))]),
+    "lanes": lambda scene: scene.still(reshaped(scene.rows, np.nan)),
+    "reshaped": lambda scene: scene.still(reshaped(scene.rows)),
+    "turned": lambda scene: scene.still(turned(scene.rows)),
     "crossed": lambda scene: scene.still([*scene.rows, *along(crossing(60, _draw()), scene.begin_ns, _draw())]),
     "free": lambda scene: scene.still(along(free(5) + free(6), scene.begin_ns, _draw())),
 }

@@ -17,19 +17,18 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, Motion, PoseBelief
-from agents.localisation.filters.smoother import NODE_NS, SmoothedPose
-from agents.pipeline import corrected
-from agents.positioning import PipelineConfig, Positioning
+from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, Motion
+from agents.localisation.filters.smoother import NODE_NS
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
+from agents.sampling import Samples, joined
 from lab.campaign.experiment import Experiment, Task
 from protocol.arrays import Floats, Ints, Table
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
-from protocol.machine.samples import empty
 from sim.recorder import TRACKS_FOLDER
 from sitegrid.proof.tracks import read_track
 
-EVERY_M = 0.5  # sample spacing
 TAKEN = 10  # readings per step: some hundredths of a second
 
 
@@ -41,8 +40,8 @@ class Nodes:
     """Beliefs at n nodes, and the readings' information between them.
 
     stamp_ns: (n,). x: (n, s), P: (n, s, s). A, W, J: (n - 1, s, s), j, shift: (n - 1, s), shift = P a. true_m: (n, 2)
-    position. way_ns: (k,), way: (k, 4) by dead reckoning: x, y [m], angle [rad], distance [m]. rows: final samples,
-    positions only. ahead_m: of the load centre.
+    position. way_ns: (k,), way: (k, 3) by dead reckoning: x, y [m], angle [rad]. rows: final samples, felt: pending
+    ones, whose slopes the agent uses. ahead_m: of the load centre.
     """
 
     stamp_ns: Ints
@@ -57,6 +56,7 @@ class Nodes:
     way_ns: Ints
     way: Floats
     rows: Table
+    felt: Table
     ahead_m: float
 
 
@@ -106,49 +106,26 @@ def with_receivers(machine: MachineConfig, count: int) -> MachineConfig:
 
 
 def watch(folder: Path, who: Machine) -> Nodes:
-    """The filter's nodes of one recorded machine."""
-    name = who.machine
-    log = open_log(folder / "logs" / name)
-    core = Positioning(log.site, with_receivers(log.machine, who.receivers), PipelineConfig())
+    """The filter's nodes and the samples of one recorded machine."""
+    log = open_log(folder / "logs" / who.machine)
+    machine = with_receivers(log.machine, who.receivers)
+    pipeline = Pipeline(log.site, machine, PipelineConfig())
+    core = pipeline.positioning
     watched = core.localiser.engine = _Watched(core.localiser.engine)
     readings = list(log.readings())
-    way: list[tuple[int, float, float, float, float]] = []
-    smoothed: list[SmoothedPose] = []
-    poses: dict[int, PoseBelief] = {}
+    way: list[tuple[int, float, float, float]] = []
+    made: list[Samples] = []
     for first in range(0, len(readings), TAKEN):
-        smoothed += core.step(readings[first : first + TAKEN])
-        at, pose = core.dead_reckoning.pose, core.pose
-        if pose and (not way or at.stamp_ns > way[-1][0]):
-            way.append((at.stamp_ns, at.x_m, at.y_m, at.angle_rad, core.dead_reckoning.distance_m))
-            poses[pose.stamp_ns] = pose
-    smoothed += core.remaining()
-    track = np.array(way)
-    way_ns = np.array([stamp for stamp, *_ in way], np.int64)
-    rows = _samples(track, poses, smoothed, log.machine.load_centre_m)
-    truth = read_track(folder / "truth" / TRACKS_FOLDER / f"{name}.csv")
+        made.append(pipeline.step(readings[first : first + TAKEN]))
+        at = core.dead_reckoning.pose
+        if core.pose and (not way or at.stamp_ns > way[-1][0]):
+            way.append((at.stamp_ns, at.x_m, at.y_m, at.angle_rad))
+    made.append(pipeline.finish())
+    pending, final = joined(made)
     stamps, segments = _segments([watched.noted[key] for key in sorted(watched.noted)])
-    ahead_m, true_m = log.machine.load_centre_m, truth.at(stamps)
-    return Nodes(stamps, *segments, true_m=true_m, way_ns=way_ns, way=track[:, 1:], rows=rows, ahead_m=ahead_m)
-
-
-def _samples(way: Floats, poses: dict[int, PoseBelief], smoothed: list[SmoothedPose], ahead_m: float) -> Table:
-    """Smoothed position samples, one per EVERY_M driven."""
-    step = np.floor(way[:, 4] / EVERY_M)
-    at = np.flatnonzero(np.diff(step, prepend=step[:1]) > 0)
-    stamps = np.array(sorted(poses))
-    near = stamps[np.clip(np.searchsorted(stamps, way[at, 0].astype(np.int64)), 0, len(stamps) - 1)]
-    placed = [corrected(poses[stamp], smoothed) for stamp in near.tolist()]
-    rows = empty(len(placed))
-    heading = np.array([pose.heading_rad for pose in placed])
-    rows["stamp_ns"], rows["heading_rad"], rows["distance_m"] = near, heading, EVERY_M
-    rows["x_m"] = [pose.x_m for pose in placed] + ahead_m * np.cos(heading)
-    rows["y_m"] = [pose.y_m for pose in placed] + ahead_m * np.sin(heading)
-    covariance = np.array([pose.covariance_m2 for pose in placed])
-    for name, (i, j) in {"cov_xx_m2": (0, 0), "cov_xy_m2": (0, 1), "cov_yy_m2": (1, 1)}.items():
-        rows[name] = covariance[:, i, j]
-    for name in ("c_rr", "c_rr_var", "grade_e", "grade_n", "grade_var"):
-        rows[name] = np.nan
-    return rows
+    truth = read_track(folder / "truth" / TRACKS_FOLDER / f"{who.machine}.csv")
+    way_ns, track = np.array([at[0] for at in way], np.int64), np.array(way)[:, 1:]
+    return Nodes(stamps, *segments, truth.at(stamps), way_ns, track, final, pending, machine.load_centre_m)
 
 
 def _segments(beliefs: list[Belief]) -> tuple[Ints, Segments]:

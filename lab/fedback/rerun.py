@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.dead_reckoning import DeadReckonedPose
-from agents.localisation.filters.belief import FREED
+from agents.localisation.filters.belief import FREED, Belief, Measurement
 from agents.localisation.filters.motion import BESIDE_S, BESIDE_STD_M, OFFSET_WALK
 from agents.localisation.filters.smoother import KEPT
-from agents.localisation.filters.state import YAW
-from agents.localisation.lanes.guards import Guards, prior_m2, share_of, shown
+from agents.localisation.filters.state import BASE_STATES, Layout
+from agents.localisation.lanes.aid import LaneAid
+from agents.localisation.lanes.guards import share_of
 from agents.localisation.lanes.lane_map import LaneMap
-from agents.localisation.lanes.matching import Match, match
-from agents.localisation.lanes.window import Window
 from agents.localisation.localiser import PROVEN_S
+from agents.sampling import LAG_NS
 from lab.fedback.nodes import Nodes
 from protocol.arrays import Floats, Table
 
@@ -74,51 +74,62 @@ class _Smoother:
         return share_of(cross[:2, -3:-1], self.offset_m2) if self.offset_m2 else 0.0
 
 
-def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -> Course:
+def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True) -> Course:
     """Rerun the filter. aids False: the original one."""
-    n = nodes.x.shape[1]
-    states = n + 3 * aids
-    window, guards, counts = Window(nodes.ahead_m), Guards(), Counter[str]()
-    d, P = np.zeros(states), np.zeros((states, states))
+    n, begin_ns = nodes.x.shape[1], int(nodes.stamp_ns[0])
+    layout = Layout(n - BASE_STATES, lanes=aids)  # only where its guards are matters
+    aid = LaneAid(nodes.ahead_m)
+    aid.lanes = maps(begin_ns)
+    prior = aid.variances_m2(begin_ns)
+    d, P = np.zeros(layout.n), np.zeros((layout.n, layout.n))
     P[:n, :n] = nodes.P[0]
     if aids:
-        P[n:, n:] = np.diag(prior_m2(young=young))
-    offset_m2 = float(prior_m2(young=young)[0]) * aids
-    smoother, live, live_m2, seen, at = _Smoother(states, offset_m2), [], [], [], 0
-    proven_ns = int(nodes.stamp_ns[0]) + round(PROVEN_S * 1e9)
+        P[n:, n:] = np.diag(prior)
+    smoother, live, live_m2, seen, follow = _Smoother(layout.n, float(prior[0]) * aids), [], [], [], _Follower(nodes)
     for k, stamp_ns in enumerate(nodes.stamp_ns.tolist()):
         if k:
             d, P = _moved(nodes, k - 1, d, P, smoother)
-        full = False
-        while aids and at < len(nodes.way_ns) and nodes.way_ns[at] <= stamp_ns:
-            if nodes.way_ns[at] >= proven_ns:
-                full = window.add(_reckoned(nodes, int(nodes.way_ns[at])))
-            at += 1
-        if full:
-            x = np.concatenate([nodes.x[k], np.zeros(3)]) + d
-            heading = float(x[YAW])
-            H = shown(states, heading)
-            window.add(_reckoned(nodes, stamp_ns))
-            back_m, headings = window.end(heading)
-            lanes = maps(stamp_ns) if guards.is_open(stamp_ns) else None
-            matched = match(lanes.of_others(stamp_ns), H @ x, H @ P @ H.T, back_m, headings) if lanes else "closed"
-            counts[matched if isinstance(matched, str) else "used"] += 1
-            if isinstance(matched, Match):
-                d, P, nis = _matched(matched, x, d, P, H, smoother)
-                seen.append(d[n:].copy())
-                if why := guards.judge(stamp_ns, d[n:], prior_m2(young=young), nis):
-                    counts[why] += 1
-                    d, P = _freed(d, P, n, prior_m2(young=young), smoother)
-                    d[n:], P[n:, :], P[:, n:] = 0.0, 0.0, 0.0
-                    P[n:, n:] = np.diag(prior_m2(young=young))
-                    smoother.C[:, :, n:] = 0.0
+        is_due = aids and follow(aid, stamp_ns)
+        mean = np.pad(nodes.x[k], (0, layout.n - n))
+        if is_due:
+            aid.is_due(_reckoned(nodes, stamp_ns))
+            aid.lanes = maps(stamp_ns)
+        for measure in (aid.measurement, aid.slope_measurement) if is_due else ():
+            if not (shown := measure(Belief(stamp_ns, mean + d, P))):
+                continue
+            d, P, nis = _conditioned(shown, mean, d, P, smoother)
+            aid.counters[f"{shown.sensor}_used"] += 1
+            seen.append(d[n:].copy())
+            if not aid.judge(Belief(stamp_ns, mean + d, P), nis, layout):
+                d, P = _freed(d, P, n, prior, smoother)
+                d[n:], P[n:, :], P[:, n:] = 0.0, 0.0, 0.0
+                P[n:, n:] = np.diag(prior)
+                smoother.C[:, :, n:] = 0.0
         x = nodes.x[k] + d[:n]
         live.append(x[:2])
         live_m2.append(P[:2, :2].copy())
         smoother.add(x, P)
     places, smoothed_m2, shares = smoother.all()
     courses = np.array(live) - nodes.true_m, np.array(live_m2), places - nodes.true_m, smoothed_m2
-    return Course(*courses, shares, counts, np.array(seen))
+    return Course(*courses, shares, aid.counters, np.array(seen))
+
+
+class _Follower:
+    """Gives an aid the way and the slopes as an agent gets them: slopes LAG_NS later, all once the heading is proven."""
+
+    def __init__(self, nodes: Nodes) -> None:
+        self._nodes, self._at, self._felt = nodes, 0, 0
+        self._at = int(np.searchsorted(nodes.way_ns, nodes.stamp_ns[0] + round(PROVEN_S * 1e9)))
+
+    def __call__(self, aid: LaneAid, stamp_ns: int) -> bool:
+        """Up to a stamp; returns whether a window has ended."""
+        nodes, is_due = self._nodes, False
+        felt = int(np.searchsorted(nodes.felt["stamp_ns"], stamp_ns - LAG_NS, side="right"))
+        for way_ns in nodes.way_ns[self._at :][nodes.way_ns[self._at :] <= stamp_ns].tolist():
+            is_due, self._at = aid.is_due(_reckoned(nodes, way_ns)), self._at + 1
+        aid.feel(nodes.felt[self._felt : felt])
+        self._felt = max(self._felt, felt)
+        return is_due
 
 
 def placed_again(nodes: Nodes, without: Course, aided: Course) -> Table:
@@ -149,16 +160,17 @@ def _freed(d: Floats, P: Floats, n: int, prior_m2: Floats, smoother: _Smoother) 
     return d - K @ d[n:], P - K @ of_guards
 
 
-def _matched(
-    matched: Match, x: Floats, d: Floats, P: Floats, H: Floats, smoother: _Smoother
+def _conditioned(
+    shown: Measurement, mean: Floats, d: Floats, P: Floats, smoother: _Smoother
 ) -> tuple[Floats, Floats, float]:
-    """Update by a match; also its normalised squared innovation."""
-    y, S, R = matched.place_m - H @ x, H @ P @ H.T + matched.covariance_m2, matched.covariance_m2
+    """Update by a measurement; also its normalised squared innovation per component."""
+    H, R = shown.jacobian(mean), shown.R
+    y, S = shown.z - H @ (mean + d), H @ P @ H.T + R
     gain = np.linalg.solve(S, H)
     K = P @ gain.T
     kept = np.eye(len(d)) - K @ H
     smoother.inform(gain.T @ y, H.T @ gain, kept)
-    return d + K @ y, kept @ P @ kept.T + K @ R @ K.T, float(y @ np.linalg.solve(S, y))
+    return d + K @ y, kept @ P @ kept.T + K @ R @ K.T, float(y @ np.linalg.solve(S, y)) / len(y)
 
 
 def _moved(nodes: Nodes, k: int, d: Floats, P: Floats, smoother: _Smoother) -> tuple[Floats, Floats]:

@@ -106,7 +106,7 @@ def _check_joints(route: Route, place: str) -> None:
 
 
 def _load(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
-    """A TOML file over its base, key by key."""
+    """A TOML file over its base, key by key, also within tables."""
     if path in seen:
         raise ConfigError(path, "is its own base")
     table = load_toml(path)
@@ -116,7 +116,9 @@ def _load(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if not isinstance(base, str):
         raise ConfigError(path, "base: the name of a scenario, or the path of a .toml file")
     below = path.parent / base if base.endswith(".toml") else FOLDER / f"{base}.toml"
-    return {**_load(below, (*seen, path)), **table}
+    known = _load(below, (*seen, path))
+    mine = {key: {**known.get(key, {}), **value} if isinstance(value, dict) else value for key, value in table.items()}
+    return {**known, **mine}
 
 
 def _tables(value: Any, where: str) -> list[dict[str, Any]]:

@@ -14,10 +14,11 @@ from agents.localisation.filters.state import YAW, Layout, X, Y
 from agents.localisation.lanes.guards import ALARMS, Guards, prior_m2, share_of, shown
 from agents.localisation.lanes.lane_map import LaneMap
 from agents.localisation.lanes.matching import Match, match
+from agents.localisation.lanes.slopes import SlopeWindow, match_slopes
 from agents.localisation.lanes.window import Window
-from protocol.arrays import Floats
+from protocol.arrays import Floats, Table
 
-LANES = "lanes"  # the name that its measurements count under
+LANES, SLOPES = "lanes", "slopes"  # the names that its measurements count under
 
 
 class LaneAid:
@@ -33,10 +34,20 @@ class LaneAid:
     def restart(self) -> None:
         """Begin anew, as localisation does."""
         self._window, self._guards, self._prior_m2 = Window(self._load_centre_m), Guards(), prior_m2(young=False)
+        self._slopes, self._reckoned = SlopeWindow(self._load_centre_m), DeadReckonedPose(0, 0.0, 0.0, 0.0, 0.0)
 
     def is_due(self, reckoned: DeadReckonedPose) -> bool:
         """Note where dead reckoning is; returns whether a window has ended there."""
+        self._reckoned = reckoned
+        self._slopes.add(reckoned)
         return self._window.add(reckoned)
+
+    def feel(self, rows: Table) -> None:
+        """Note the slopes of new samples."""
+        heading_rad = rows["heading_rad"].astype(float)
+        slope = rows["grade_e"] * np.cos(heading_rad) + rows["grade_n"] * np.sin(heading_rad)
+        for felt in zip(rows["stamp_ns"].tolist(), slope.tolist(), rows["distance_m"].tolist(), strict=True):
+            self._slopes.feel(*felt)
 
     def variances_m2(self, stamp_ns: int) -> Floats:
         """Of the states that the layout has with lanes (3,), before anything is known of them."""
@@ -59,8 +70,27 @@ class LaneAid:
         z, R = matched.place_m, matched.covariance_m2
         return Measurement(LANES, belief.stamp_ns, z, R, lambda x: x @ H.T, lambda _: H, relocks=False)
 
+    def slope_measurement(self, belief: Belief) -> Measurement | None:
+        """What the slopes felt since the last such measurement show along the heading; None where that is nothing."""
+        heading_rad = float(belief.x[YAW])
+        profile = self._slopes.end(self._reckoned, heading_rad)
+        if profile is None or self.lanes is None or not self._guards.is_open(belief.stamp_ns):
+            return None
+        place = shown(len(belief.x), heading_rad)
+        H = np.array([[math.cos(heading_rad), math.sin(heading_rad)]]).dot(place)
+        lanes, along_m2 = self.lanes.of_others(belief.stamp_ns), H.dot(belief.P).dot(H.T)
+        matched = match_slopes(lanes, place.dot(belief.x), float(along_m2[0, 0]), heading_rad, profile)
+        if isinstance(matched, str):
+            self.counters[f"{SLOPES}_{matched}"] += 1
+            return None
+        z, R = H.dot(belief.x) + matched[0], np.array([[matched[1]]])
+        return Measurement(SLOPES, belief.stamp_ns, z, R, lambda x: x @ H.T, lambda _: H, relocks=False)
+
     def judge(self, belief: Belief, nis: float, layout: Layout) -> bool:
-        """Look at the belief after a measurement; returns whether lanes fit. Where not they are off for a while."""
+        """Look at the belief after a measurement; returns whether lanes fit. Where not they are off for a while.
+
+        nis: normalised innovation squared per component.
+        """
         self._std_m = math.sqrt(float(np.linalg.eigvalsh(belief.P[X : Y + 1, X : Y + 1])[-1]))
         alarm = self._guards.judge(belief.stamp_ns, belief.x[layout.lane_guards], self._prior_m2, nis)
         self.counters[f"{LANES}_{alarm}"] += bool(alarm)

@@ -20,7 +20,7 @@ OFFSET_STD_M, YOUNG_OFFSET_STD_M = 1.0, 1.5  # of m; of a map of one day, whose 
 AFTER_NS = 30_000_000_000  # without lanes after the heading is proven: the filter must have settled
 OFF_NS = 300_000_000_000  # after an alarm
 ALARM_SIGMA = 2.0  # m or l further from 0 than so many of their standard deviations: lanes are elsewhere
-WINDOWS, MOST_NIS = 8, 4.0  # mean of so many normalised innovations squared, 2 if all is right
+WINDOWS, MOST_NIS = 8, 2.0  # mean of so many normalised innovations squared per component, 1 if all is right
 ALARMS = {
     "map_moved": "the map's lanes lie elsewhere",
     "beside_lanes": "the machine keeps beside the map's lanes",

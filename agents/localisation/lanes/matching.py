@@ -52,20 +52,28 @@ def match(lanes: LaneMap, place_m: Floats, P: Floats, back_m: Floats, heading_ra
     L = np.linalg.cholesky(P)
     u = np.linalg.solve(L, shift_m.T).T
     log_prior = -0.5 * (u**2).sum(axis=1)
-    _, bare = _moments(log_prior, u)
+    _, bare = moments(log_prior, u)
     driven = _driven(lanes, (place_m + back_m) / step_m, heading_rad, reach).reshape(len(back_m), -1)
     floor = FLOOR * driven.max(axis=1, keepdims=True) + FLOOR_M
-    mean, V = _moments(SHARPNESS * np.log(driven + floor).mean(axis=0) + log_prior, u)
+    mean, V = moments(SHARPNESS * np.log(driven + floor).mean(axis=0) + log_prior, u)
     if mean @ mean > FAR_SIGMA**2:
         return "far"
     values, vectors = np.linalg.eigh(2 * V / bare.trace())
     if values[0] > FLAT:
         return "flat"
-    left = np.clip(values, LEAST_SHARE, MOST_SHARE)
-    most = FAR_SIGMA * np.sqrt(1 - left)
     along = L @ vectors  # (2, 2), a column for each eigenvector
-    variance = left / (1 - left) + MAP_STD_M**2 / (along**2).sum(axis=0)
-    return Match(place_m + along @ (np.clip(vectors.T @ mean, -most, most) / (1 - left)), (along * variance) @ along.T)
+    off, variance = shown_by(vectors.T @ mean, values, (along**2).sum(axis=0))
+    return Match(place_m + along @ off, (along * variance) @ along.T)
+
+
+def shown_by(mean: Floats, left: Floats, variance_m2: Floats) -> tuple[Floats, Floats]:
+    """What turned a prior into mean and variance (k,), both in its deviations: a measurement's offset and variance.
+
+    variance_m2 (k,): of the prior.
+    """
+    left = np.clip(left, LEAST_SHARE, MOST_SHARE)
+    most = FAR_SIGMA * np.sqrt(1 - left)
+    return np.clip(mean, -most, most) / (1 - left), left / (1 - left) + MAP_STD_M**2 / variance_m2
 
 
 def _driven(lanes: LaneMap, centre: Floats, heading_rad: Floats, reach: Floats) -> Floats:
@@ -103,8 +111,8 @@ def _doubled(patch: Floats) -> Floats:
     return out
 
 
-def _moments(log_w: Floats, u: Floats) -> tuple[Floats, Floats]:
-    """Mean (2,) and covariance (2, 2) of weights (n,), given as logarithms, at places u (n, 2)."""
+def moments(log_w: Floats, u: Floats) -> tuple[Floats, Floats]:
+    """Mean (k,) and covariance (k, k) of weights (n,), given as logarithms, at places u (n, k)."""
     w = np.exp(log_w - log_w.max())
     w /= w.sum()
     mean = w @ u

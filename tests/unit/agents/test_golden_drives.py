@@ -168,7 +168,7 @@ def figures(case: Case) -> dict[str, Any]:
     known = Calibration(0.003, 0.01, ((4e-6, 0.0), (0.0, 4e-4)), START_NS - 10**9, 80)
     pipeline = Pipeline(site, vehicle, options, known)
     made = [pipeline.step(readings[i : i + 500]) for i in range(0, len(readings), 500)]
-    positioning, health = pipeline._positioning, pipeline.health()
+    positioning, health = pipeline.positioning, pipeline.health()
     belief = positioning.localiser.belief
     assert belief
     samples = joined([*made, pipeline.finish()])

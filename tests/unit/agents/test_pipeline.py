@@ -349,7 +349,7 @@ def test_known_ground_has_to_be_all_around_an_unsure_position(std_m: float, c_rr
     """8 m inside its edge: 3 m plus twice the std."""
     pad = KnownGround("pad", 0.04, ((0.0, 0.0), (40.0, 0.0), (40.0, 40.0), (0.0, 40.0)))
     pipeline = Pipeline(replace(SITE, known_ground=(pad,)), VEHICLE, PipelineConfig())
-    pipeline._positioning.poses.append(PoseBelief(START_NS, 8.0, 20.0, 0.0, 2.0, std_m**2 * np.eye(2)))
+    pipeline.positioning.poses.append(PoseBelief(START_NS, 8.0, 20.0, 0.0, 2.0, std_m**2 * np.eye(2)))
     assert pipeline._known_c_rr() == c_rr
 
 

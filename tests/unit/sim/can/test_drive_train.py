@@ -112,7 +112,7 @@ def test_an_agent_reads_of_the_bus_what_the_machine_does() -> None:
         readings += (heard := simulator.advance()[machine.name])
         pipeline.step(heard)
         true = float(simulator.state.drive_n[0] / simulator.state.mass_kg[0] / GRAVITY_MPS2)
-        pulls.append((true, pipeline._positioning.dead_reckoning.traction))
+        pulls.append((true, pipeline.positioning.dead_reckoning.traction))
     by_truth, by_agent = np.array(pulls[100:]).T
     assert by_truth.max() > 0.05
     assert np.median(np.abs(by_agent - by_truth)) < 0.015, "wheels slip by it"
