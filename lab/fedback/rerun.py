@@ -115,7 +115,7 @@ def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True) -> Course:
 
 
 class _Follower:
-    """Gives an aid the way and the slopes as an agent gets them: slopes LAG_NS later, all once the heading is proven."""
+    """Gives an aid what an agent gets once the heading is proven: the way, and slopes LAG_NS later."""
 
     def __init__(self, nodes: Nodes) -> None:
         self._nodes, self._at, self._felt = nodes, 0, 0

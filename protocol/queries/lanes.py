@@ -85,7 +85,7 @@ def decode_lanes(data: bytes) -> LanesAnswer:
     plain = inflated(take(table, "metres", bytes), n * SHAPE[0] * SHAPE[1], "metres")
     metres = np.frombuffer(plain, np.uint8).reshape(n, *SHAPE)
     slopes = np.full((n, *SLOPES), UNKNOWN_SLOPE, np.int8)
-    if "slopes" in table:
+    if table.get("slopes") is not None:
         plain = inflated(take(table, "slopes", bytes), slopes.size, "slopes")
         slopes = np.frombuffer(plain, np.int8).reshape(slopes.shape)
     x, y, newest_ns, passes, days, machines = columns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import time
+import zlib
 from typing import Any
 
 import msgpack
@@ -60,6 +61,19 @@ def region(
             for i, row in enumerate(_rows(answer, name)):
                 whole[name][at["row"] + i][at["column"] : at["column"] + answer["columns"]] = row
     return first, whole
+
+
+def slopes(answer: dict[str, Any]) -> dict[tuple[int, int], tuple[float, float]]:
+    """Gradient east and north of an answer of `lanes`, by column and row of 4 x 4 cells, where it is known."""
+    x, y = (struct.unpack(f"<{answer['n']}q", answer["cols"][name]) for name in ("x", "y"))
+    steps = struct.unpack(f"{32 * answer['n']}b", zlib.decompress(answer["slopes"]))
+    out = {}
+    for square, at in enumerate(zip(x, y, strict=True)):
+        for part in range(16):
+            east, north = steps[32 * square + part], steps[32 * square + 16 + part]
+            if east != -128:
+                out[4 * at[0] + part % 4, 4 * at[1] + part // 4] = 0.002 * east, 0.002 * north
+    return out
 
 
 def _rows(answer: dict[str, Any], name: str) -> list[list[float]]:

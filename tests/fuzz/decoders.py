@@ -101,6 +101,7 @@ _SINGLE = (
     "region",
     "history",
     "tiles",
+    "lanes",
     "why",
     "segments",
     "worklist",

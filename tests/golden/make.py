@@ -20,6 +20,7 @@ from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, GpsV
 from protocol.machine.samples import OPTIONAL, SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
+from protocol.queries import lanes
 from protocol.queries.calibration import (
     CalibrationAnswer,
     CorrectedSpan,
@@ -226,6 +227,11 @@ WHY = CellReasons(
     sectors=(1.0, 0.5),
     machines=("loader-1", "loader-2"),
 )
+METRES = np.zeros(lanes.SHAPE, np.uint8)
+METRES[4, 8::16] = 200
+SLOPED = np.full(lanes.SLOPES, lanes.UNKNOWN_SLOPE, np.int8)
+SLOPED[:, 1::4] = [[-127, -1, 0, 127], [3, 2, 1, 0]]
+LANES = lanes.LanesAnswer(VERSION, T0, 1.0, (lanes.LaneTile(-1, 2, T0, 9, 2, 3, METRES, SLOPED),))
 ERROR = QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
 OVERLOADED = QueryError(Refusal.OVERLOADED, "the server has too many queries to answer", 2.5)
 
@@ -311,6 +317,7 @@ GOLDEN: dict[str, Golden] = {
     "points.bin": Golden(points(), answers.encode_points, answers.decode_points),
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
     "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
+    "lanes.bin": Golden(LANES, lanes.encode_lanes, lanes.decode_lanes),
     "why.bin": Golden(WHY, encode_why, decode_why),
     "route.bin": Golden(ROUTE, encode_answer, decode_answer),
     "segments.bin": Golden(ROADS, encode_segments, decode_segments),

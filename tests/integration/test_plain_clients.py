@@ -60,6 +60,18 @@ def test_the_plain_sender_writes_a_batch_as_the_golden_file_has_it():
     assert {name: written[name] for name in golden} == golden
 
 
+def test_the_plain_asker_reads_the_slopes_of_the_golden_lanes() -> None:
+    answer = msgpack.unpackb((GOLDEN / "lanes.bin").read_bytes())
+    read = {at: (round(east, 3), round(north, 3)) for at, (east, north) in plain_asker.slopes(answer).items()}
+    column = -4 + 1  # of the second parts from the west, of square -1
+    assert read == {
+        (column, 8): (-0.254, 0.006),
+        (column, 9): (-0.002, 0.004),
+        (column, 10): (0.0, 0.002),
+        (column, 11): (0.254, 0.0),
+    }
+
+
 class Lot:
     """Router, map server, plain senders: killed and restarted at will."""
 

@@ -57,10 +57,10 @@ class SlopeWindow:
     def add(self, reckoned: DeadReckonedPose) -> None:
         """Note where dead reckoning is."""
         at = reckoned.stamp_ns, reckoned.x_m, reckoned.y_m, reckoned.angle_rad
+        while self._way and reckoned.stamp_ns - self._way[0][0] > LONGEST_NS:
+            self._way.popleft()
         if not self._way or math.dist(self._way[-1][1:3], at[1:3]) >= STEP_M:
             self._way.append(at)
-        while reckoned.stamp_ns - self._way[0][0] > LONGEST_NS:
-            self._way.popleft()
 
     def feel(self, stamp_ns: int, slope: float, metres: float) -> None:
         """Note the slope along the machine where it was at a stamp, over so many metres."""
@@ -89,8 +89,7 @@ class SlopeWindow:
 def match_slopes(
     lanes: LaneMap, place_m: Floats, along_m2: float, heading_rad: float, profile: Profile
 ) -> tuple[float, float] | str:
-    """How far ahead on the map the machine is, and the variance of that [m, m2]; or why not: `unknown`,
-    `unfit` or `flat`.
+    """How far ahead on the map the machine is, and the variance [m, m2]; or why not: `unknown`, `unfit`, `flat`.
 
     place_m (2,), along_m2: the place and its variance along the heading, as believed.
     """

@@ -9,7 +9,7 @@ import numpy as np
 from agents.lane_link import AGAIN_S, MOST_S, MOVED_M, SLOWER, LaneLink
 from agents.localisation.filters.belief import PoseBelief
 from protocol.queries.answers import MapVersion
-from protocol.queries.lanes import SHAPE, LanesAnswer, LanesQuery, LaneTile, encode_lanes
+from protocol.queries.lanes import SHAPE, SLOPES, LanesAnswer, LanesQuery, LaneTile, encode_lanes
 from protocol.queries.parameters import split_selector
 
 STORE = "0123456789abcdef"
@@ -30,7 +30,7 @@ class Network:
         if not self.is_up:
             return
         tiles = tuple(
-            LaneTile(x, y, newest, 1, 1, 1, np.zeros(SHAPE, np.uint8))
+            LaneTile(x, y, newest, 1, 1, 1, np.zeros(SHAPE, np.uint8), np.zeros(SLOPES, np.int8))
             for (x, y), newest in self.tiles.items()
             if newest > (query.since_ns or 0)
         )

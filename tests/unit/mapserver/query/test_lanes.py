@@ -1,8 +1,10 @@
 """Lanes equal the fold by heading; abandoned ones fade."""
 
+import zlib
 from contextlib import closing
 from dataclasses import replace
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.views import read_cells, read_lanes, view_of
 from protocol.errors import MessageError
 from protocol.machine.samples import empty
-from protocol.queries.lanes import SCALE_M, LanesQuery, decode_lanes, encode_lanes, strokes
+from protocol.queries.lanes import SCALE_M, SLOPE_STEP, UNKNOWN_SLOPE, LanesQuery, decode_lanes, encode_lanes, strokes
 from protocol.queries.requests import parse_query
 from protocol.site.geometry import Bounds, CellWindow
 from tests.unit.mapserver.data import SITE, incoming, open_writer, random_samples, send
@@ -102,6 +104,52 @@ def test_lanes_are_asked_for_whole_by_place_and_by_news(tmp_path):
     assert 0 < len(news.tiles) < len(whole.tiles)
     assert {tile.x for tile in news.tiles} <= {-1, 0, 1}
     assert whole.cell_m == SITE.cell_m
+
+
+def slopes(answer, x, y):
+    """East and north of 4 x 4 parts of a square."""
+    (tile,) = (tile for tile in answer.tiles if (tile.x, tile.y) == (x, y))
+    steps = tile.slopes.reshape(2, 4, 4).astype(float)
+    return np.where(steps == UNKNOWN_SLOPE, np.nan, SLOPE_STEP * steps)
+
+
+def sloped(rows, east, north):
+    rows["grade_e"], rows["grade_n"] = east, north
+    return rows
+
+
+def test_slopes_are_the_gradient_where_machines_drove_and_nan_elsewhere():
+    first = passes(5.5, 3, BEGIN_NS)
+    east, north = slopes(lanes_of(sloped(first, 0.013, -0.4 + 0.01 * np.floor(first["y_m"] / 4))), 0, 1)
+    np.testing.assert_allclose(east[:, 1], 0.013, atol=SLOPE_STEP)
+    np.testing.assert_allclose(north[:, 1], -0.254)  # steeper is not told apart
+    assert np.isnan(east[:, 3]).all()
+    assert np.isnan(north[:, 3]).all()
+    assert np.isnan(slopes(lanes_of(sloped(first.copy(), np.nan, np.nan)), 0, 1)).all()  # of machines without an IMU
+    north = slopes(lanes_of(sloped(first, 0.0, 0.01 * np.floor(first["y_m"] / 4))), 0, 1)[1]
+    np.testing.assert_allclose(north[:, 1], 0.01 * np.arange(4, 8), atol=2 * SLOPE_STEP)
+
+
+def test_slopes_follow_ground_that_was_shaped_anew_and_leave_out_what_lanes_placed():
+    old, new = (sloped(passes(5.5, 6, BEGIN_NS + i * DAY_NS), slope, 0.0) for i, slope in enumerate((0.0, 0.03)))
+    aided = new.copy()
+    aided["aid_share"] = 1.0
+    kept = 0.9 * np.exp(-6 * 16 / 128)  # of the old passes: a day, six passes of a square
+    np.testing.assert_allclose(slopes(lanes_of(old, new), 0, 1)[0, :, 1], 0.03 / (1 + kept), atol=SLOPE_STEP)
+    np.testing.assert_allclose(slopes(lanes_of(old, aided), 0, 1)[0, :, 1], 0.0, atol=1e-9)
+
+
+def test_lanes_of_a_server_without_slopes_have_none():
+    answer = lanes_of(sloped(passes(5.5, 3, BEGIN_NS), 0.01, 0.0))
+    table = msgpack.unpackb(encode_lanes(replace(answer, version=replace(answer.version, store="0123456789abcdef"))))
+    slopes_of = table.pop("slopes")
+    assert all((tile.slopes == UNKNOWN_SLOPE).all() for tile in decode_lanes(msgpack.packb(table)).tiles)
+    for bad, reason in ((zlib.compress(b"x"), "column_length"), (b"xyz", "wrong_type"), ([1], "wrong_type")):
+        with pytest.raises(MessageError, match="slopes") as refused:
+            decode_lanes(msgpack.packb({**table, "slopes": bad}))
+        assert refused.value.reason == reason
+        assert "\n" not in str(refused.value)
+    assert len(slopes_of) < 0.25 * len(table["metres"])
 
 
 def test_strokes_lie_where_machines_drove_and_the_way_they_did():

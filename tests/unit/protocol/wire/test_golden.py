@@ -20,6 +20,8 @@ def same(a, b) -> bool:
         return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
     if isinstance(a, dict):
         return list(a) == list(b) and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
     if isinstance(a, Exception):
         return type(a) is type(b) and str(a) == str(b) and vars(a) == vars(b)
     return a == b

@@ -19,9 +19,10 @@ from agents.localisation.lanes.guards import AFTER_NS, OFF_NS, Guards, prior_m2,
 from agents.localisation.lanes.lane_map import LaneMap
 from agents.localisation.lanes.matching import FAR_SIGMA, Match, match
 from agents.localisation.lanes.window import WINDOW_M, Window
-from protocol.queries.lanes import SCALE_M, LaneTile
+from protocol.queries.lanes import SCALE_M, SLOPES, UNKNOWN_SLOPE, LaneTile
 
 LAYOUT = Layout(imus=1, lanes=True)
+NO_SLOPES = np.full(SLOPES, UNKNOWN_SLOPE, np.int8)
 SQUARE = [(0.0, 0.0, 0.0), (40.0, 0.0, math.pi / 2), (40.0, 40.0, math.pi), (0.0, 40.0, -math.pi / 2)]
 
 
@@ -29,7 +30,9 @@ def lane_map(metres):
     """Lanes around the origin, 8 x 8 squares; metres (16, rows, columns)."""
     planes = SCALE_M.quantised(np.where(metres > 0, metres, np.nan))
     tiles = {
-        (x, y): LaneTile(x, y, 1, 9, 2, 3, planes[:, 16 * y + 64 :, 16 * x + 64 :][:, :16, :16].reshape(16, 256))
+        (x, y): LaneTile(
+            x, y, 1, 9, 2, 3, planes[:, 16 * y + 64 :, 16 * x + 64 :][:, :16, :16].reshape(16, 256), NO_SLOPES
+        )
         for x in range(-4, 4)
         for y in range(-4, 4)
     }
