@@ -95,7 +95,7 @@ def match_slopes(
     """
     std_m, step_m = math.sqrt(along_m2), lanes.cell_m / 2
     reach = min(max(math.ceil(GRID_SIGMA * std_m / step_m), 1), MOST_NODES)
-    ahead_m = np.arange(-reach, reach + 1) * step_m
+    ahead_m = step_m * np.arange(-reach, reach + 1, dtype=np.float64)
     x, y = (
         place_m[:, None, None]
         + profile.back_m.T[:, None, :]
@@ -111,8 +111,8 @@ def match_slopes(
     fit = -0.5 * (np.linalg.solve(L, off.T) ** 2).sum(axis=0)
     if -2 * fit.max() > MOST_OFF * off.shape[1]:
         return "unfit"
-    u = (ahead_m / std_m)[:, None]
-    log_prior = -0.5 * u[:, 0] ** 2
+    u: Floats = (ahead_m / std_m)[:, None]
+    log_prior: Floats = -0.5 * u[:, 0] ** 2
     mean, V = moments(np.logaddexp(fit[:-1], fit[-1] + VERY_STRONG) + log_prior, u)
     left = V[0] / moments(log_prior, u)[1][0]
     if left[0] > FLAT:

@@ -100,6 +100,15 @@ def base(vehicle: MachineConfig, recorded: list[Reading]) -> Base:
     return run(vehicle, recorded)
 
 
+def test_the_aid_by_lanes_feels_the_slopes_of_all_samples(vehicle: MachineConfig, recorded: list[Reading]) -> None:
+    pipeline, felt = simulated_pipeline(vehicle), []
+    assert pipeline.lanes
+    pipeline.lanes.feel = felt.append  # type: ignore[method-assign]
+    samples = pipeline.step(recorded)
+    assert np.concatenate(felt).tobytes() == samples.pending.tobytes()
+    assert len(samples.pending) > 20
+
+
 # --- what goes in and comes out --------------------------------------------------------------------------------------
 
 
