@@ -1,4 +1,4 @@
-"""Lanes as one machine uses them: each window that it has driven becomes a measurement of its place."""
+"""Lanes as one machine uses them: each window of its way or slopes becomes a measurement of its place."""
 
 from __future__ import annotations
 

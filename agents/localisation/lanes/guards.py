@@ -1,9 +1,10 @@
 """What keeps lanes from pulling a machine where it is not: two states, and alarms that turn the aid off for a while.
 
 m: the map's offset, east and north. l: how far to the left of the fleet's lanes this machine keeps, a Gauss-Markov
-process, as drivers and roads differ. A match measures p + m + l n, n to the left of the heading. Fixes, which know
-nothing of m and l, tell these from the place in the long run, and bends tell l at once. After an alarm the place is
-what it would be if hardly anything had been assumed of m and l (`freed`): lanes pull it no longer.
+process, as drivers and roads differ. A match measures p + m + l n, n to the left of the heading t; slopes measure
+t (p + m). Fixes, which know nothing of m and l, tell these from the place in the long run, and bends tell l at once.
+After an alarm the place is what it would be if hardly anything had been assumed of m and l (`freed`): lanes pull it no
+longer.
 """
 
 from __future__ import annotations

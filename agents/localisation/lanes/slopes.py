@@ -37,7 +37,7 @@ BIAS = 0.02  # of an accelerometer, 0.2 m/s2
 
 
 @dataclass(frozen=True)
-class Profile:
+class GradeProfile:
     """Slopes felt along the machine (j,), way back to them in `map` (j, 2) [m], headings there (j,)."""
 
     slope: Floats
@@ -68,7 +68,7 @@ class SlopeWindow:
         if stamp_ns >= self._opens_ns and math.isfinite(slope):
             self._felt.append((stamp_ns, slope, metres))
 
-    def end(self, reckoned: DeadReckonedPose, heading_rad: float) -> Profile | None:
+    def end(self, reckoned: DeadReckonedPose, heading_rad: float) -> GradeProfile | None:
         """The profile, if there is enough of it; then the next one begins. heading_rad: in `map`, where it is now."""
         self.add(reckoned)
         while self._felt and self._felt[0][0] < self._way[0][0]:
@@ -83,11 +83,11 @@ class SlopeWindow:
         c, s = math.cos(turn), math.sin(turn)
         place_m = np.stack([x + self._ahead_m * np.cos(angle), y + self._ahead_m * np.sin(angle)], axis=1)
         back_m = (place_m - (reckoned.x_m, reckoned.y_m)) @ np.array([[c, s], [-s, c]])
-        return Profile(slope, back_m, angle + turn)
+        return GradeProfile(slope, back_m, angle + turn)
 
 
 def match_slopes(
-    lanes: LaneMap, place_m: Floats, along_m2: float, heading_rad: float, profile: Profile
+    lanes: LaneMap, place_m: Floats, along_m2: float, heading_rad: float, profile: GradeProfile
 ) -> tuple[float, float] | str:
     """How far ahead on the map the machine is, and the variance [m, m2]; or why not: `unknown`, `unfit`, `flat`.
 

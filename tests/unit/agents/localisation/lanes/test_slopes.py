@@ -14,7 +14,7 @@ from agents.localisation.filters.ukf import Ukf
 from agents.localisation.lanes.aid import SLOPES, LaneAid
 from agents.localisation.lanes.guards import prior_m2
 from agents.localisation.lanes.lane_map import LaneMap
-from agents.localisation.lanes.slopes import AFTER_NS, PROFILE_M, Profile, SlopeWindow, match_slopes
+from agents.localisation.lanes.slopes import AFTER_NS, PROFILE_M, GradeProfile, SlopeWindow, match_slopes
 from agents.localisation.lanes.window import LONGEST_NS
 from protocol.machine.samples import empty
 from protocol.queries.lanes import SHAPE, SLOPE_CELLS, SLOPE_STEP, UNKNOWN_SLOPE, LaneTile
@@ -47,7 +47,7 @@ def profile(heading_rad, slope=waves, noise=0.001):
     back_m = np.stack([-np.arange(0, PROFILE_M, 0.5) * math.cos(heading_rad), np.zeros(round(2 * PROFILE_M))], axis=1)
     felt = slope(back_m[:, 0]) * math.cos(heading_rad) + BIAS
     felt += np.random.default_rng(4).normal(0, noise, len(felt))
-    return Profile(felt, back_m, np.full(len(felt), heading_rad))
+    return GradeProfile(felt, back_m, np.full(len(felt), heading_rad))
 
 
 def level(x_m):
