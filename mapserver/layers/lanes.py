@@ -6,7 +6,7 @@ direction, and with age:
     metres = sum of passes (1 - aid_share) exp(-later metres / FADES_M) 2^(-age / FADES_DAYS)
 
 1 - aid_share removes what positions took from lanes, which must not confirm themselves. Slopes of the ground are the
-centre of gradient votes, which fade with the passes that gave them.
+mean of gradient votes, which fade with the passes that gave them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from mapserver.evidence import cells as ev
 from mapserver.evidence.settling import DAY_S
 from mapserver.evidence.timeline import Block, TimedPage, TimedPages
-from mapserver.layers.statistics import ratio, robust_centre
 from protocol.arrays import Floats, Ints
 from protocol.queries.lanes import SCALE_M, SLOPE_CELLS, SLOPE_STEP, SLOPES, UNKNOWN_SLOPE, LaneTile
 from protocol.site.geometry import BLOCK_CELLS
@@ -26,13 +25,13 @@ FADES_M = 8 * BLOCK_CELLS * 1.0  # metres, eight passes: fewer know the middle l
 FADES_DAYS = 7.0  # half-life of an unused lane [days]
 LEAST_M = 0.1  # smaller values [m] are left out
 LEAST_SLOPE_M = 1.0  # of passes in a part with a slope: a quarter of one
-GRADES = slice(ev.GRADE_EAST.start, ev.GRADE_NORTH.stop)
+MOMENTS = np.stack([np.ones(ev.GRADE_BINS), ev.GRADE_CENTRES])  # of gradient votes: their sum, and that of slopes
 
 
 def lane_tile(block: Block, pages: TimedPages, first: Ints, stamp_ns: int) -> LaneTile | None:
     """Lanes of one block, None if undriven. first: index (256,) of each cell's first valid page."""
     metres, later_m = np.zeros((ev.SECTORS, ev.CELLS)), np.zeros(ev.SECTORS)
-    grades = np.zeros((GRADES.stop - GRADES.start, ev.CELLS))
+    grades = np.zeros((2, 2, ev.CELLS))  # votes, and slopes times votes: east, north
     visits, machines = np.zeros(ev.CELLS, np.uint64), np.uint64(0)
     newest_ns, days = 0, set()
     for index, timed in reversed(list(enumerate(pages))):
@@ -44,7 +43,8 @@ def lane_tile(block: Block, pages: TimedPages, first: Ints, stamp_ns: int) -> La
         age = max(stamp_ns - ended_ns, 0) / (DAY_S * 1e9)
         left = driven * np.exp(-later_m / FADES_M)[:, None] * 2 ** (-age / FADES_DAYS)
         metres += left
-        grades += counts[GRADES] * np.nan_to_num(ratio(left.sum(axis=0), counts[ev.HEADING].sum(axis=0)))
+        kept = left.sum(axis=0) / np.maximum(counts[ev.HEADING].sum(axis=0), 1)
+        grades += kept * np.stack([MOMENTS @ counts[part] for part in (ev.GRADE_EAST, ev.GRADE_NORTH)], axis=1)
         along_m = driven.sum(axis=1)
         later_m += along_m + np.roll(along_m, 1) + np.roll(along_m, -1)
         visits[cells["cell"]] |= cells["visits"]
@@ -67,11 +67,9 @@ def _by_sector(timed: TimedPage, first: Ints, index: int) -> tuple[Floats, Float
     return counts, metres * own
 
 
-def _slopes(metres: Floats) -> NDArray[np.int8]:
-    """Gradient of the parts of a block in steps, of metres by gradient bin (66, 256)."""
-    side = BLOCK_CELLS // SLOPE_CELLS
-    votes = metres.reshape(2, ev.GRADE_BINS, side, SLOPE_CELLS, side, SLOPE_CELLS).sum(axis=(3, 5))
-    votes = np.moveaxis(votes, 1, -1).reshape(*SLOPES, ev.GRADE_BINS)
-    slope = np.interp(robust_centre(votes, reach=1.5), np.arange(ev.GRADE_BINS), ev.GRADE_CENTRES)
-    steps = np.clip(np.rint(slope / SLOPE_STEP), UNKNOWN_SLOPE + 1, -UNKNOWN_SLOPE - 1)
-    return np.where(votes.sum(axis=-1) >= LEAST_SLOPE_M, steps, UNKNOWN_SLOPE).astype(np.int8)
+def _slopes(grades: Floats) -> NDArray[np.int8]:
+    """Mean gradient of the parts of a block in steps. grades (2, 2, 256): metres, slopes times metres; east, north."""
+    shape = (BLOCK_CELLS // SLOPE_CELLS, SLOPE_CELLS)
+    metres, climbs = grades.reshape(2, 2, *shape, *shape).sum(axis=(3, 5)).reshape(2, *SLOPES)
+    steps = np.rint(climbs / np.maximum(metres, LEAST_SLOPE_M) / SLOPE_STEP).clip(UNKNOWN_SLOPE + 1, -UNKNOWN_SLOPE - 1)
+    return np.where(metres >= LEAST_SLOPE_M, steps, UNKNOWN_SLOPE).astype(np.int8)

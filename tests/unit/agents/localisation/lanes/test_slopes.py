@@ -168,4 +168,5 @@ def test_windows_leave_a_covariance_and_level_ground_changes_no_bit(engine, slop
     else:
         assert abs(belief.x[0] + belief.x[-3] + 0.5) < 0.5  # it stands half a metre before the origin
         assert belief.P[0, 0] < 0.5 * start.P[0, 0]
+        assert aid.share(belief.P[:2, LAYOUT.map_offset]) > 0.2
         assert belief.P[1, 1] == pytest.approx(start.P[1, 1], rel=0.05)  # nothing shown across
