@@ -48,6 +48,7 @@ class FedbackCase:
 CASES = (
     *(FedbackCase("driven", name) for name in MAPS if name not in ("reshaped", "turned")),
     *(FedbackCase("slopes", name) for name in SLOPED),
+    FedbackCase("haul", "lanes"),
     FedbackCase("driven", "mature", receivers=1),
     *(FedbackCase(site, "mature") for site in REPEATED),
     FedbackCase("driven", "row"),
